@@ -1,0 +1,29 @@
+# Each target sets up everything that it needs (setup.sh), so that it works on a fresh machine.
+# The stamp holds the folder that was set up: a moved or copied folder is set up again, because .venv does not move.
+VENV   := .venv
+PYTHON := $(VENV)/bin/python
+STAMP  := $(VENV)/.ready
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test clean FORCE
+
+help:
+	@echo 'make demo    render and relight the example scene'
+	@echo 'make test    run the tests (ARGS="-k name" passes options to pytest)'
+	@echo 'make clean   remove the Python environment; the next make sets it up again'
+
+demo: $(STAMP)
+	$(PYTHON) examples/demo.py $(ARGS)
+
+test: $(STAMP)
+	$(PYTHON) -m pytest -q $(ARGS)
+
+clean:
+	rm -rf $(VENV)
+
+$(STAMP): pyproject.toml setup.sh
+	./setup.sh
+
+ifneq ("$(CURDIR)","$(shell test -x $(PYTHON) && cat $(STAMP) 2>/dev/null)")
+$(STAMP): FORCE
+endif

@@ -1,0 +1,49 @@
+"""Precomputed radiance transfer for Mitsuba 3.
+
+>>> import mi_prt
+>>> asset = mi_prt.precompute("scene.xml", directions="cubemap:32", coefficients=48)
+>>> asset.save("scene.prt")
+>>> light = mi_prt.EnvironmentMap("sky.exr").rotated(axis="y", degrees=30)
+>>> mi_prt.load("scene.prt").relight(light)   # outgoing radiance at the points, (n, 3)
+
+Importing this package chooses the LLVM that Dr.Jit will load and registers the integrator plugin `prt` with Mitsuba.
+"""
+
+from .llvm import select_llvm
+
+select_llvm()  # before anything can load Dr.Jit: an LLVM that is too old would end the process
+
+from . import plugin  # noqa: E402
+from .asset import Asset, load  # noqa: E402
+from .errors import (  # noqa: E402
+    AssetError,
+    InputError,
+    LightError,
+    PrtError,
+    RuntimeSetupError,
+    SceneError,
+    SettingsError,
+)
+from .lighting.environment import EnvironmentMap, LightWarning  # noqa: E402
+from .lighting.light import DirectionalLight, DistantLight  # noqa: E402
+from .precompute import precompute  # noqa: E402
+
+__version__ = "0.1.0"
+__all__ = [
+    "Asset",
+    "AssetError",
+    "DirectionalLight",
+    "DistantLight",
+    "EnvironmentMap",
+    "InputError",
+    "LightError",
+    "LightWarning",
+    "PrtError",
+    "RuntimeSetupError",
+    "SceneError",
+    "SettingsError",
+    "load",
+    "precompute",
+]
+
+plugin.register()

@@ -1,0 +1,236 @@
+"""The asset: everything that relighting needs, in one self-describing HDF5 file.
+
+The file is read with NumPy and h5py alone; docs/asset-format.md describes it field by field.
+"""
+
+import json
+import os
+import tempfile
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from .basis.pca import PCA
+from .directions import parse_directions
+from .errors import AssetError, SettingsError
+from .lighting.cells import cell_radiance
+from .points.lattice import Patches
+from .points.points import Points
+
+FORMAT = "mi_prt asset"
+FORMAT_VERSION = 1
+UNITS = {
+    "points/positions": "m",
+    "points/areas": "m^2",
+    "points/albedo": "1, linear RGB reflectance",
+    "directions/solid_angles": "sr",
+    "basis/mean": "irradiance per unit radiance and steradian (1)",
+    "coefficients": "sr^(1/2)",
+    "irradiance": "W/m^2",
+    "outgoing radiance": "W/(m^2 sr)",
+}
+_POINT_FIELDS = ("positions", "normals", "geometric_normals", "albedo", "areas", "uv", "surface")
+_PATCH_FIELDS = ("levels", "offsets", "nodes", "back")
+_BASIS_FIELDS = ("vectors", "mean", "sqrt_weights", "captured_variance")
+
+
+@dataclass(frozen=True, eq=False)
+class Asset:
+    """A scene's precomputed transport.
+
+    Parameters
+    ----------
+    points : Points
+    buried : (n,) bool
+        Points inside or against other geometry; rendering takes their neighbours' light instead.
+    directions : Cubemap
+    basis : PCA
+    coefficients : (n, d) float32
+    scene : dict
+        kind, path, parameters, hash and left_out (what of the scene is not modelled).
+    settings : dict
+        What the run used.
+    versions : dict
+    report : dict
+        Counts from sampling: rays, dark and buried points, irregular geometry.
+    path : Path or None
+        The file it was loaded from or saved to.
+    """
+
+    points: Points
+    buried: np.ndarray
+    directions: object
+    basis: PCA
+    coefficients: np.ndarray
+    scene: dict
+    settings: dict
+    versions: dict
+    report: dict
+    path: Path | None = field(default=None, compare=False)
+
+    # --- relighting ----------------------------------------------------------------------------------------------
+
+    def project_light(self, light):
+        """Distant light in this asset's basis.
+
+        Parameters
+        ----------
+        light : EnvironmentMap, DistantLight, DirectionalLight, path, array (h, w, 3), or mi.Bitmap
+
+        Returns
+        -------
+        coefficients : (d, 3) float32
+        mean_response : (3,) float32
+        """
+        return self.basis.project_light(cell_radiance(light, self.directions))
+
+    def irradiance(self, light):
+        """Irradiance at the points under distant light, (n, 3) float32 in W/m². See `project_light` for `light`."""
+        return self.irradiance_from(*self.project_light(light))
+
+    def irradiance_from(self, coefficients, mean_response):
+        """Irradiance (n, 3) from light that is projected already: c·ℓ + m (Eigentransport eq. 10, mean kept exactly).
+
+        What compression leaves below zero is zero.
+        """
+        irradiance = self.coefficients @ coefficients
+        irradiance += mean_response
+        return np.maximum(irradiance, 0, out=irradiance)
+
+    def relight(self, light):
+        """Outgoing radiance B = ρ/π · E at the points, (n, 3) float32 in W/(m²·sr). See `project_light` for `light`."""
+        irradiance = self.irradiance(light)
+        irradiance *= self.points.albedo
+        irradiance *= 1 / np.pi
+        return irradiance
+
+    def transport(self, rows):
+        """Transport (len(rows), s) float32 as the basis reconstructs it; `rows` indexes points."""
+        return self.basis.reconstruct(self.coefficients[rows])
+
+    # --- file ----------------------------------------------------------------------------------------------------
+
+    def save(self, path):
+        """Write the asset to one file, all or nothing.
+
+        Raises
+        ------
+        SettingsError
+            If the path cannot be written.
+        """
+        path = Path(path)
+        check_writable(path)
+        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
+        os.close(handle)
+        try:
+            self._write(temporary)
+            os.chmod(temporary, 0o666 & ~_umask())
+            os.replace(temporary, path)
+        except OSError as error:
+            raise SettingsError(f"'{path}' cannot be written: {error}") from None
+        finally:
+            Path(temporary).unlink(missing_ok=True)
+        object.__setattr__(self, "path", path.absolute())
+
+    def _write(self, path):
+        import h5py
+
+        with h5py.File(path, "w", libver="latest") as file:
+            file.attrs["format"] = FORMAT
+            file.attrs["format_version"] = FORMAT_VERSION
+            for name in ("scene", "settings", "versions", "report"):
+                file.attrs[name] = json.dumps(getattr(self, name), sort_keys=True)
+            file.attrs["units"] = json.dumps(UNITS, sort_keys=True)
+            for name in _POINT_FIELDS:
+                file[f"points/{name}"] = getattr(self.points, name)
+            file["points/buried"] = self.buried
+            file["points"].attrs["report"] = json.dumps(self.points.report, sort_keys=True)
+            file["points"].attrs["surfaces"] = json.dumps(self.points.surfaces, sort_keys=True)
+            for name in _PATCH_FIELDS:
+                file[f"points/patches/{name}"] = getattr(self.points.patches, name)
+            file["directions/vectors"] = self.directions.vectors
+            file["directions/solid_angles"] = self.directions.solid_angles
+            file["directions"].attrs["lattice"] = str(self.directions)
+            for name in _BASIS_FIELDS:
+                file[f"basis/{name}"] = getattr(self.basis, name)
+            file["basis"].attrs["kind"] = "pca"
+            file["coefficients"] = self.coefficients
+            file.attrs["complete"] = True
+
+
+def load(path):
+    """Open an asset.
+
+    Parameters
+    ----------
+    path : path
+
+    Returns
+    -------
+    Asset
+
+    Raises
+    ------
+    AssetError
+        If the file is missing, truncated, no asset, or of a format version this program does not know.
+    """
+    import h5py
+
+    path = Path(path)
+    if not path.is_file():
+        raise AssetError(f"asset '{path}' does not exist")
+    try:
+        with h5py.File(path, "r") as file:
+            if file.attrs.get("format") != FORMAT:
+                raise AssetError(f"'{path}' is an HDF5 file but no mi_prt asset: make one with `mi-prt precompute`")
+            version = int(file.attrs["format_version"])
+            if version != FORMAT_VERSION:
+                raise AssetError(
+                    f"asset '{path}' has format version {version}, this program reads {FORMAT_VERSION}: precompute it again"
+                )
+            if not file.attrs.get("complete"):
+                raise AssetError(f"asset '{path}' is incomplete: precompute it again")
+            return _read(file, path)
+    except (OSError, KeyError, ValueError) as error:
+        if isinstance(error, AssetError):
+            raise
+        reason = " ".join(str(error).split())
+        raise AssetError(f"'{path}' is truncated or no mi_prt asset ({reason})") from None
+
+
+def _read(file, path):
+    texts = {name: json.loads(file.attrs[name]) for name in ("scene", "settings", "versions", "report")}
+    points = file["points"]
+    return Asset(
+        points=Points(
+            **{name: points[name][()] for name in _POINT_FIELDS},
+            patches=Patches(**{name: points[f"patches/{name}"][()] for name in _PATCH_FIELDS}),
+            surfaces=tuple(json.loads(points.attrs["surfaces"])),
+            report=json.loads(points.attrs["report"]),
+        ),
+        buried=points["buried"][()],
+        directions=parse_directions(file["directions"].attrs["lattice"]),
+        basis=PCA(**{name: file[f"basis/{name}"][()] for name in _BASIS_FIELDS}),
+        coefficients=file["coefficients"][()],
+        path=path.absolute(),
+        **texts,
+    )
+
+
+def check_writable(path):
+    """Raise SettingsError unless a file can be created at `path`."""
+    path = Path(path)
+    folder = path.absolute().parent
+    if path.is_dir():
+        raise SettingsError(f"output '{path}' is a folder: give a file name")
+    if not folder.is_dir():
+        raise SettingsError(f"output folder '{folder}' does not exist: create it first")
+    if not os.access(folder, os.W_OK) or (path.exists() and not os.access(path, os.W_OK)):
+        raise SettingsError(f"output '{path}' cannot be written: permission denied")
+
+
+def _umask():
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask

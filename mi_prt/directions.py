@@ -1,0 +1,167 @@
+"""Direction lattices: unit vectors that partition the sphere into cells of known solid angle."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from .errors import SettingsError
+
+MAX_CUBEMAP_RESOLUTION = 512  # 1.6 million directions: beyond any transport matrix this program could hold
+
+# Frame of each cube face: columns are the axes of the face coordinates (a, b) and of its outward normal.
+_FACES = np.array(
+    [
+        [[0, 0, -1], [0, 1, 0], [1, 0, 0]],  # +x
+        [[0, 0, 1], [0, 1, 0], [-1, 0, 0]],  # -x
+        [[1, 0, 0], [0, 0, -1], [0, 1, 0]],  # +y
+        [[1, 0, 0], [0, 0, 1], [0, -1, 0]],  # -y
+        [[1, 0, 0], [0, 1, 0], [0, 0, 1]],  # +z
+        [[-1, 0, 0], [0, 1, 0], [0, 0, -1]],  # -z
+    ],
+    dtype=np.float64,
+)
+
+
+@dataclass(frozen=True)
+class Cubemap:
+    """Equi-angular cubemap lattice with 6·N·N cells.
+
+    The cells of a face are equally wide in angle, not in the face's plane, so that the solid angles of one
+    map differ by at most √2 instead of 5.2 and the resolution is the same in the middle of a face and at its
+    corners. Cell index: (face·N + row)·N + column, faces in the order +x, −x, +y, −y, +z, −z.
+
+    Parameters
+    ----------
+    resolution : int
+        N, cells along an edge of a face.
+
+    Raises
+    ------
+    SettingsError
+        If the resolution is outside 1…512.
+    """
+
+    resolution: int
+
+    def __post_init__(self):
+        if not 1 <= self.resolution <= MAX_CUBEMAP_RESOLUTION:
+            raise SettingsError(
+                f"cubemap resolution {self.resolution} is outside 1…{MAX_CUBEMAP_RESOLUTION}: use for example cubemap:32"
+            )
+
+    def __str__(self):
+        return f"cubemap:{self.resolution}"
+
+    def __len__(self):
+        return 6 * self.resolution**2
+
+    @cached_property
+    def vectors(self):
+        """Unit vectors through the cell centres, (s, 3) float32."""
+        return self.subdivided(1)[0][:, 0]
+
+    @cached_property
+    def solid_angles(self):
+        """Exact solid angles of the cells, (s,) float64 in sr, sum 4π."""
+        return _cell_solid_angles(self.resolution, self.resolution).ravel()
+
+    def subdivided(self, rays):
+        """Split every cell into `rays` sub-cells, as square as the number allows.
+
+        Parameters
+        ----------
+        rays : int
+            Number of sub-cells r of a cell.
+
+        Returns
+        -------
+        vectors : (s, r, 3) float32
+            Unit vectors through the centres of the sub-cells.
+        fractions : (s, r) float32
+            Share of the cell's solid angle that each sub-cell has; rows sum to 1.
+        """
+        rows = max(i for i in range(1, int(rays**0.5) + 1) if rays % i == 0)
+        columns = rays // rows
+        n = self.resolution
+        a = np.tan(np.pi / 4 * _centres(n * columns))
+        b = np.tan(np.pi / 4 * _centres(n * rows))
+        grid = np.stack(np.broadcast_arrays(a[None, :], b[:, None], 1.0), axis=-1)
+        vectors = np.einsum("hwi,fij->fhwj", grid, _FACES)
+        vectors /= np.linalg.norm(vectors, axis=-1, keepdims=True)
+        solid_angles = _cell_solid_angles(n * rows, n * columns)
+
+        def by_cell(x):
+            x = x.reshape(6, n, rows, n, columns, -1).transpose(0, 1, 3, 2, 4, 5)
+            return x.reshape(len(self), rays, -1)
+
+        solid_angles = by_cell(solid_angles[..., None])[..., 0]
+        fractions = solid_angles / solid_angles.sum(axis=1, keepdims=True)
+        return by_cell(vectors).astype(np.float32), fractions.astype(np.float32)
+
+    def cells(self, vectors):
+        """Index of the cell that each direction falls in.
+
+        Parameters
+        ----------
+        vectors : (k, 3) array
+            Directions of any positive length.
+
+        Returns
+        -------
+        (k,) int64
+        """
+        x, y, z = np.ascontiguousarray(vectors.T)
+        ax, ay, az = np.abs(x), np.abs(y), np.abs(z)
+        on_x = (ax >= ay) & (ax >= az)
+        on_y = ~on_x & (ay >= az)
+        major = np.where(on_x, x, np.where(on_y, y, z))
+        negative = np.signbit(major)
+        scale = 1.0 / np.abs(major)
+        sign = np.where(negative, -scale, scale)
+        # Coordinates on the face; the signs follow the frames in _FACES.
+        a = np.where(on_x, -z * sign, np.where(on_y, x * scale, x * sign))
+        b = np.where(on_y, -z * sign, y * scale)
+        face = np.where(on_x, 0, np.where(on_y, 2, 4)) + negative
+        n = self.resolution
+        column = _index_along(a, n)
+        row = _index_along(b, n)
+        return (face * n + row) * n + column
+
+
+def _index_along(tangent, n):
+    return np.clip((np.arctan(tangent) * (2 * n / np.pi) + n / 2).astype(np.int64), 0, n - 1)
+
+
+def _centres(n):
+    return (np.arange(n) + 0.5) * (2 / n) - 1
+
+
+def _cell_solid_angles(rows, columns):
+    """Exact solid angles (6, rows, columns) of equi-angular cells, from the solid angle of a rectangle at its corner."""
+    a = np.tan(np.pi / 4 * np.linspace(-1, 1, columns + 1))
+    b = np.tan(np.pi / 4 * np.linspace(-1, 1, rows + 1))[:, None]
+    corner = np.arctan2(a * b, np.sqrt(a * a + b * b + 1))
+    face = np.diff(np.diff(corner, axis=0), axis=1)
+    return np.broadcast_to(face, (6, rows, columns)).copy()
+
+
+def parse_directions(text):
+    """Direction lattice from its name.
+
+    Parameters
+    ----------
+    text : str or Cubemap
+        ``cubemap:N``; a lattice is returned as it is.
+
+    Raises
+    ------
+    SettingsError
+        If the name is not of that form or N is out of range.
+    """
+    if isinstance(text, Cubemap):
+        return text
+    kind, _, resolution = str(text).partition(":")
+    if kind != "cubemap" or not resolution.isdigit():
+        raise SettingsError(f"directions '{text}' are not known: use cubemap:N, for example cubemap:32")
+    return Cubemap(int(resolution))

@@ -1,0 +1,136 @@
+"""The distant light of a Mitsuba scene, from its emitters."""
+
+import numpy as np
+
+from ..errors import LightError
+from ..runtime import mitsuba
+from ..scene.traversal import transform_of
+from .environment import EnvironmentMap
+from .light import DirectionalLight, DistantLight
+
+BAKED_HEIGHT = 512  # rows of the map that an analytic sky is baked to
+SUN_SPLITS = 256  # samples across a pixel in which a sun was found
+SUN_SEARCH = 1 << 16  # emitter samples that look for a sun
+
+
+def scene_light(scene):
+    """All distant light of a scene: `envmap`, `constant`, `sunsky`, `directional`, and any other distant emitter.
+
+    Parameters
+    ----------
+    scene : Scene
+
+    Returns
+    -------
+    DistantLight
+
+    Raises
+    ------
+    LightError
+        If the scene has no distant emitter, or one holds NaN, infinite or negative radiance.
+    """
+    if not scene.distant_emitters:
+        raise LightError("the scene has no distant light (envmap, constant, sunsky, directional): pass an environment map")
+    return emitters_light(scene.distant_emitters)
+
+
+def emitters_light(emitters):
+    """The sum of some distant emitters as DistantLight; see `scene_light`."""
+    maps, directionals = [], []
+    for emitter in emitters:
+        kind = emitter.class_name()
+        if kind == "DirectionalEmitter":
+            directionals.append(_directional(emitter))
+        elif kind == "EnvironmentMapEmitter":
+            maps.append(_environment_map(emitter))
+        elif kind == "ConstantBackgroundEmitter":
+            radiance = _evaluate(emitter, np.array([[0.0, 1.0, 0.0]]))
+            maps.append(EnvironmentMap(np.broadcast_to(radiance, (2, 4, 3))))
+        else:
+            maps.append(_baked(emitter))
+    return DistantLight(tuple(maps), tuple(directionals))
+
+
+def _directional(emitter):
+    it = _origin(1)
+    sample, irradiance = emitter.sample_direction(it, mitsuba().Point2f(0.5))
+    return DirectionalLight(-np.array(sample.d).reshape(-1, 3)[0], _rgb(irradiance)[0])
+
+
+def _environment_map(emitter):
+    mi = mitsuba()
+    parameters = mi.traverse(emitter)
+    data = np.array(parameters["data"])
+    # Mitsuba pads the rows with a column at either end, for wrapping round.
+    return EnvironmentMap(data[:, 1:-1, :3], transform_of(emitter)[:3, :3], scale=float(np.array(parameters["scale"]).ravel()[0]))
+
+
+def _baked(emitter):
+    """Any other emitter, averaged over the pixels of a map; pixels that hold a sun are sampled densely.
+
+    The samples that Mitsuba itself would take of the emitter tell where a sun is: those brighter than the map has
+    them mark pixels to refine.
+    """
+    height, width = BAKED_HEIGHT, 2 * BAKED_HEIGHT
+    pixels = _pixel_means(emitter, np.indices((height, width)).reshape(2, -1).T, height, 2).reshape(height, width, 3)
+    mi = mitsuba()
+    side = int(SUN_SEARCH**0.5)
+    grid = (np.indices((side, side)).reshape(2, -1) + 0.5) / side
+    sample, weight = emitter.sample_direction(_origin(side * side), mi.Point2f(grid))
+    direction = np.array(sample.d).T
+    row, column = _pixel_of(direction, height)
+    brighter = (_rgb(weight) * np.array(sample.pdf)[:, None]).max(axis=1) > 1.5 * pixels[row, column].max(axis=1) + 1e-6
+    marked = np.zeros((height, width), bool)
+    for i in (-1, 0, 1):
+        for j in (-1, 0, 1):
+            marked[np.clip(row[brighter] + i, 0, height - 1), (column[brighter] + j) % width] = True
+    # A sun fills a handful of pixels. Where much of the sky is marked it is merely steep, and the map is good enough.
+    found = np.argwhere(marked)
+    if 0 < len(found) <= 256:
+        for pixel in found:
+            pixels[tuple(pixel)] = _pixel_means(emitter, pixel[None], height, SUN_SPLITS)[0]
+    return EnvironmentMap(pixels)
+
+
+def _pixel_means(emitter, pixels, height, splits):
+    """Mean radiance (k, 3) over the pixels (row, column), each around its centre, from splits² samples."""
+    offsets = (np.indices((splits, splits)).reshape(2, -1).T + 0.5) / splits - 0.5
+    sums, weights = 0.0, 0.0
+    for chunk in np.array_split(offsets, max(1, len(pixels) * len(offsets) >> 20)):
+        rows = pixels[:, None, 0] + chunk[None, :, 0]
+        columns = pixels[:, None, 1] + chunk[None, :, 1]
+        theta = np.clip(rows * (np.pi / (height - 1)), 0, np.pi)
+        phi = (columns + 0.5) * (np.pi / height)
+        sine = np.sin(theta)
+        directions = np.stack([np.sin(phi) * sine, np.cos(theta), -np.cos(phi) * sine], axis=-1)
+        radiance = _evaluate(emitter, directions.reshape(-1, 3)).reshape(*rows.shape, 3)
+        sums = sums + (radiance * sine[..., None]).sum(axis=1)
+        weights = weights + sine.sum(axis=1)[:, None]
+    return sums / np.maximum(weights, 1e-12)
+
+
+def _pixel_of(directions, height):
+    x, y, z = directions.T
+    row = np.rint(np.arccos(np.clip(y, -1, 1)) * ((height - 1) / np.pi)).astype(np.int64)
+    column = np.floor(np.arctan2(x, -z) * (height / np.pi)).astype(np.int64) % (2 * height)
+    return row, column
+
+
+def _evaluate(emitter, directions):
+    """Radiance (k, 3) that arrives from directions (k, 3)."""
+    import drjit as dr
+
+    mi = mitsuba()
+    si = dr.zeros(mi.SurfaceInteraction3f, len(directions))
+    si.wi = -mi.Vector3f(directions.T.astype(np.float32))
+    return np.broadcast_to(_rgb(emitter.eval(si)), directions.shape)
+
+
+def _origin(count):
+    import drjit as dr
+
+    return dr.zeros(mitsuba().Interaction3f, count)
+
+
+def _rgb(colour):
+    return np.array(mitsuba().Color3f(colour)).reshape(3, -1).T.astype(np.float64)

@@ -1,0 +1,183 @@
+"""From a hit on a scene's surface to the three points around it, in closed form."""
+
+import numpy as np
+
+from ..errors import SceneError
+from ..runtime import mitsuba
+from ..scene.scene import mesh_arrays
+from .tessellate import TESSELLATED_SHAPES
+
+NO_PATCH = 0xFFFFFFFF
+
+
+class PatchLocator:
+    """Finds the points around surface hits of one Mitsuba scene.
+
+    The scene may be organised otherwise than the one the points were made from: Mitsuba's loader merges meshes that
+    share a material by default. Mesh faces are therefore matched by the positions of their corners, analytic shapes by
+    their place in the world, once, when the locator is made.
+
+    Parameters
+    ----------
+    scene : Scene
+        The scene in which hits occur.
+    points : Points
+
+    Raises
+    ------
+    SceneError
+        If a surface of the scene is not among the points' surfaces.
+    """
+
+    def __init__(self, scene, points):
+        mi = mitsuba()
+        patches = points.patches
+        self._match(scene, points)
+        self._levels = mi.UInt32(patches.levels.ravel().astype(np.uint32))
+        self._offsets = mi.UInt32(patches.offsets.astype(np.uint32))
+        self._nodes = mi.UInt32(patches.nodes.astype(np.uint32))
+        self._back = mi.UInt32(patches.back.astype(np.uint32))
+
+    def _match(self, scene, points):
+        """Fill the tables that lead from (shape, instance, primitive) to patches."""
+        import drjit as dr
+
+        mi = mitsuba()
+        faces = _FaceIndex(points)
+        analytic = {s["signature"]: s["first_patch"] for s in points.surfaces}
+        tables, starts, total = [], {}, 0
+        for surface in scene.surfaces:
+            if surface.kind == "mesh":
+                patch = faces.patches_of(surface)
+            elif surface.kind in TESSELLATED_SHAPES:
+                patch = np.array([analytic.get(surface.signature, NO_PATCH)])
+            else:
+                patch = np.array([NO_PATCH])
+            missing = int((patch == NO_PATCH).sum())
+            if missing and surface.kind in TESSELLATED_SHAPES:
+                raise SceneError(
+                    f"shape '{surface.name}' has {missing} faces that the asset does not know: "
+                    "the scene's geometry changed since it was precomputed; precompute it again"
+                )
+            starts[_registry_id(surface.instance), _registry_id(surface.shape)] = total
+            tables.append(patch)
+            total += len(patch)
+        shape_count = max(shape for _, shape in starts) + 1
+        lookup = np.full((max(instance for instance, _ in starts) + 1) * shape_count, NO_PATCH)
+        for (instance, shape), start in starts.items():
+            lookup[instance * shape_count + shape] = start
+        self._shape_count = dr.opaque(mi.UInt32, shape_count)
+        self._starts = mi.UInt32(lookup.astype(np.uint32))
+        self._patch = mi.UInt32(np.concatenate(tables).astype(np.uint32))
+
+    def locate(self, pi, si, active):
+        """The points around hits.
+
+        Parameters
+        ----------
+        pi : mi.PreliminaryIntersection3f
+        si : mi.SurfaceInteraction3f
+        active : mi.Bool
+
+        Returns
+        -------
+        points : tuple of three mi.UInt32
+            Indices of points; on the side of the surface that `si.wi` is on.
+        weights : tuple of three mi.Float
+            Barycentric weights, sum 1.
+        found : mi.Bool
+            Whether the hit lies on a surface that has points on that side.
+        """
+        import drjit as dr
+
+        mi = mitsuba()
+        shape = dr.reinterpret_array(mi.UInt32, si.shape)
+        instance = dr.reinterpret_array(mi.UInt32, si.instance)
+        start = dr.gather(mi.UInt32, self._starts, instance * self._shape_count + shape, active)
+        found = active & (start != NO_PATCH)
+        patch = dr.gather(mi.UInt32, self._patch, start + pi.prim_index, found)
+        found &= patch != NO_PATCH
+
+        # --- position on the patch's lattice: barycentric for triangles, (u, v) for analytic shapes
+        level_u = dr.gather(mi.UInt32, self._levels, 2 * patch, found)
+        level_v = dr.gather(mi.UInt32, self._levels, 2 * patch + 1, found)
+        triangle = level_v == 0
+        uv = dr.select(triangle, pi.prim_uv, si.uv)
+        rows = dr.select(triangle, level_u, level_v)
+        x, y = dr.clip(uv.x, 0, 1) * mi.Float(level_u), dr.clip(uv.y, 0, 1) * mi.Float(rows)
+        j = dr.minimum(mi.UInt32(y), dr.maximum(rows, 1) - 1)
+        columns = dr.maximum(dr.select(triangle, level_u - j, level_u), 1)
+        i = dr.minimum(mi.UInt32(x), columns - 1)
+        fx, fy = dr.clip(x - mi.Float(i), 0, 1), dr.clip(y - mi.Float(j), 0, 1)
+        # In the last small triangle of a row there is no upper half; rounding can put a hit just across.
+        upper = (fx + fy > 1) & ~(triangle & (i + 1 == columns))
+        outside = dr.maximum(fx + fy, 1)
+        fx, fy = dr.select(upper, fx, fx / outside), dr.select(upper, fy, fy / outside)
+
+        # --- the three nodes around it and their points
+        def node(i, j):
+            in_triangle = j * (level_u + 1) - dr.select(j > 0, j * (j - 1) // 2, 0) + i
+            return dr.select(triangle, in_triangle, j * (level_u + 1) + i)
+
+        back = dr.gather(mi.UInt32, self._back, patch, found)
+        behind = si.wi.z < 0
+        found &= ~behind | (back > 0)
+        first = dr.gather(mi.UInt32, self._offsets, patch, found)
+        numbers = (
+            dr.select(upper, node(i + 1, j + 1), node(i, j)),
+            dr.select(upper, node(i, j + 1), node(i + 1, j)),
+            dr.select(upper, node(i + 1, j), node(i, j + 1)),
+        )
+        shift = dr.select(behind, back, 0)
+        points = tuple(dr.gather(mi.UInt32, self._nodes, first + n, found) + shift for n in numbers)
+        weights = (
+            dr.select(upper, fx + fy - 1, 1 - fx - fy),
+            dr.select(upper, 1 - fx, fx),
+            dr.select(upper, 1 - fy, fy),
+        )
+        return points, weights, found
+
+
+class _FaceIndex:
+    """Patches of mesh faces, found by the positions of their three corners."""
+
+    def __init__(self, points):
+        patches = points.patches
+        is_triangle = np.flatnonzero(patches.levels[:, 1] == 0)
+        k = patches.levels[is_triangle, 0].astype(np.int64)
+        first = patches.offsets[is_triangle]
+        corners = np.stack([first, first + k, first + (k + 1) * (k + 2) // 2 - 1], axis=-1)
+        keys = _corner_keys(points.positions[patches.nodes[corners]])
+        order = np.argsort(keys)
+        self._keys, self._patches = keys[order], is_triangle[order]
+
+    def patches_of(self, surface):
+        """Patch (f,) of each face of a mesh; NO_PATCH where there is none. Faces of zero area match anything."""
+        positions, faces, _, _ = mesh_arrays(surface.shape)
+        world = (positions.astype(np.float64) @ surface.to_world[:3, :3].T + surface.to_world[:3, 3]).astype(np.float32)
+        corners = world[faces]
+        keys = _corner_keys(corners)
+        # Coincident faces have equal keys: the k-th of them in the scene takes the k-th of the points'.
+        order = np.argsort(keys, kind="stable")
+        ordered = keys[order]
+        repeat = np.empty(len(keys), np.int64)
+        repeat[order] = np.arange(len(keys)) - np.searchsorted(ordered, ordered)
+        low, high = np.searchsorted(self._keys, keys), np.searchsorted(self._keys, keys, side="right")
+        place = np.minimum(low + repeat, np.maximum(high - 1, low))
+        known = high > low
+        patch = np.where(known, self._patches[np.minimum(place, len(self._keys) - 1)] if len(self._keys) else 0, NO_PATCH)
+        doubled = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+        return np.where(~known & (doubled <= 1e-10 * max(doubled.max(initial=0.0), 1e-300)), 0, patch)
+
+
+def _corner_keys(corners):
+    """One comparable key (f,) for the exact float32 positions (f, 3, 3) of each face's corners."""
+    exact = np.ascontiguousarray(corners.reshape(-1, 9) + np.float32(0))  # −0 becomes +0
+    return exact.view(np.dtype((np.void, 36))).ravel()
+
+
+def _registry_id(node):
+    import drjit as dr
+
+    mi = mitsuba()
+    return 0 if node is None else int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(node))[0])

@@ -1,0 +1,190 @@
+"""The points at which transport is known, for a whole scene."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..errors import SceneError, SettingsError
+from ..runtime import mitsuba
+from .lattice import Patches, node_count
+from .tessellate import TESSELLATED_SHAPES, patch_levels, tessellate
+
+POINT_BUDGET = 40_000  # points that `auto` edge length aims at, beyond the meshes' own vertices
+MAX_POINTS = 4_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """Surface points of a scene.
+
+    Parameters
+    ----------
+    positions, normals : (n, 3) float32
+        World space; the normals are Mitsuba's shading normals, unit, on the side that reflects.
+    geometric_normals : (n, 3) float32
+        Mean normal of the faces around the point, on the side of `normals`.
+    albedo : (n, 3) float32
+        Diffuse reflectance, RGB.
+    areas : (n,) float32
+        m²; back sides carry their own.
+    uv : (n, 2) float32
+    surface : (n,) int32
+        Index into `surfaces`.
+    patches : Patches
+    surfaces : tuple of dict
+        name, kind, signature, first_patch and patches (their number) of each surface of the scene.
+    report : dict
+        What was irregular: counts of degenerate faces, zero and flipped normals, back sides; edge length in metres.
+    """
+
+    positions: np.ndarray
+    normals: np.ndarray
+    geometric_normals: np.ndarray
+    albedo: np.ndarray
+    areas: np.ndarray
+    uv: np.ndarray
+    surface: np.ndarray
+    patches: Patches
+    surfaces: tuple
+    report: dict
+
+    def __len__(self):
+        return len(self.positions)
+
+
+def sample_points(scene, edge_length="auto"):
+    """Points on all surfaces of a scene.
+
+    Vertices of meshes are points; faces and analytic shapes with longer edges are tessellated down to the edge
+    length. Two-sided surfaces that do not enclose a volume get points on both sides.
+
+    Parameters
+    ----------
+    scene : Scene
+    edge_length : 'auto' or float
+        Metres. `auto` takes the finest length for which a scene stays near 40,000 points.
+
+    Returns
+    -------
+    Points
+
+    Raises
+    ------
+    SceneError
+        If no shape can be sampled or a mesh is broken.
+    SettingsError
+        If the edge length is not positive or would give more than 4 million points.
+    """
+    length = choose_edge_length(scene, edge_length)
+    surfaces, backs = [], []
+    counts = {"degenerate_faces": 0, "zero_normals": 0, "flipped_normals": 0, "back_points": 0}
+    total = patch_total = 0
+    columns = {name: [] for name in ("positions", "normals", "geometric_normals", "albedo", "areas", "uv", "surface")}
+    levels, nodes = [], []
+    for index, surface in enumerate(scene.surfaces):
+        if surface.kind not in TESSELLATED_SHAPES:
+            surfaces.append(_describe(surface, patch_total, 0))
+            continue
+        part = tessellate(surface, length)
+        sides = (1, -1) if surface.material.two_sided and not part.closed else (1,)
+        n = len(part.positions)
+        for side in sides:
+            columns["positions"].append(part.positions)
+            columns["normals"].append(side * part.normals)
+            columns["geometric_normals"].append(side * part.geometric_normals)
+            columns["albedo"].append(_albedo(surface, part, side))
+            columns["areas"].append(part.areas)
+            columns["uv"].append(part.uv)
+            columns["surface"].append(np.full(n, index))
+        surfaces.append(_describe(surface, patch_total, len(part.levels)))
+        levels.append(part.levels)
+        nodes.append(part.nodes + total)
+        backs.append(np.full(len(part.levels), n if len(sides) == 2 else 0))
+        for key, value in part.counts.items():
+            counts[key] += value
+        counts["back_points"] += n * (len(sides) - 1)
+        total += n * len(sides)
+        patch_total += len(part.levels)
+    if not total:
+        kinds = sorted({s.kind for s in scene.surfaces})
+        raise SceneError(f"none of the scene's shapes ({', '.join(kinds)}) can be sampled: use meshes or spheres, disks, …")
+    levels = np.concatenate(levels).astype(np.int32)
+    sizes = node_count(levels[:, 0].astype(np.int64), levels[:, 1].astype(np.int64))
+    joined = {name: np.concatenate(values) for name, values in columns.items()}
+    return Points(
+        **{name: values.astype(np.int32 if name == "surface" else np.float32) for name, values in joined.items()},
+        patches=Patches(
+            levels, np.cumsum(sizes) - sizes, np.concatenate(nodes).astype(np.int32), np.concatenate(backs).astype(np.int32)
+        ),
+        surfaces=tuple(surfaces),
+        report={"edge_length": length, **counts},
+    )
+
+
+def _describe(surface, first_patch, patches):
+    return {
+        "name": surface.name,
+        "kind": surface.kind,
+        "signature": surface.signature,
+        "first_patch": first_patch,
+        "patches": patches,
+    }
+
+
+def choose_edge_length(scene, edge_length="auto"):
+    """The edge length in metres that `sample_points` uses, see there."""
+    surfaces = [s for s in scene.surfaces if s.kind in TESSELLATED_SHAPES]
+    if edge_length != "auto":
+        try:
+            length = float(edge_length)
+        except ValueError:
+            raise SettingsError(f"edge length '{edge_length}' is neither 'auto' nor a number of metres") from None
+        if not (np.isfinite(length) and length > 0):
+            raise SettingsError(f"edge length {edge_length} must be a positive number of metres")
+        count = _count(surfaces, length)
+        if count > MAX_POINTS:
+            raise SettingsError(f"edge length {length:g} m gives about {count:,} points, above {MAX_POINTS:,}: use a longer one")
+        return length
+    coarsest, finest = scene.scale / 4, scene.scale / 400
+    budget = max(POINT_BUDGET, _count(surfaces, np.inf) + POINT_BUDGET // 4)
+    if _count(surfaces, finest) <= budget:
+        return finest
+    for _ in range(12):  # bisection to 0.1 %
+        middle = np.sqrt(coarsest * finest)
+        if _count(surfaces, middle) > budget:
+            finest = middle
+        else:
+            coarsest = middle
+    return float(coarsest)
+
+
+def _count(surfaces, edge_length):
+    """About the number of points at an edge length: nodes, less those shared by neighbouring patches."""
+    total = 0
+    for surface in surfaces:
+        levels = patch_levels(surface, edge_length).astype(np.int64)
+        sides = 2 if surface.material.two_sided and surface.kind != "Sphere" else 1
+        if surface.kind == "mesh":
+            # v vertices, k − 1 nodes inside each edge (shared by two faces), the rest inside the faces.
+            k = levels[:, 0]
+            total += sides * int(surface.shape.vertex_count() + (1.5 * (k - 1) + (k - 1) * (k - 2) // 2).sum())
+        else:
+            total += sides * int(node_count(levels[:, 0], levels[:, 1]).sum())
+    return total
+
+
+def _albedo(surface, part, side):
+    """Diffuse reflectance (n, 3) of a surface's points, looked up in its modelled material."""
+    import drjit as dr
+
+    mi = mitsuba()
+    si = dr.zeros(mi.SurfaceInteraction3f, len(part.positions))
+    si.p = mi.Point3f(part.local_positions.T.astype(np.float32))
+    si.n = mi.Normal3f((side * part.geometric_normals).T.astype(np.float32))
+    si.sh_frame = mi.Frame3f(mi.Normal3f((side * part.normals).T.astype(np.float32)))
+    si.uv = mi.Point2f(part.uv.T)
+    si.wi = mi.Vector3f(0, 0, side)
+    si.prim_index = mi.UInt32(part.primitives.astype(np.uint32))
+    si.shape = mi.ShapePtr(surface.shape)
+    reflectance = np.array(mi.Color3f(surface.material.modelled.eval_diffuse_reflectance(si)))
+    return np.broadcast_to(reflectance.reshape(3, -1).T, (len(part.positions), 3))

@@ -1,0 +1,302 @@
+"""Points of one surface: mesh vertices, and lattices over coarse faces and analytic shapes."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..errors import SceneError
+from ..scene.scene import mesh_arrays
+from ..scene.traversal import transform_of
+from .lattice import lattice_nodes, lattice_triangles, node_count
+
+MAX_LEVEL = 4096
+# Least levels (k_u, k_v) that keep the polygonal outline of a curved shape smooth, for any edge length.
+_LEAST_LEVELS = {"Sphere": (32, 16), "Cylinder": (32, 1), "Disk": (1, 32)}
+TESSELLATED_SHAPES = ("mesh", *_LEAST_LEVELS)
+
+
+@dataclass(frozen=True, eq=False)
+class SurfacePoints:
+    """Points of one surface and the patches that connect them.
+
+    Parameters
+    ----------
+    positions, normals, geometric_normals : (n, 3) float64
+        World space; the geometric normals look to the side of the shading normals.
+    uv : (n, 2) float32
+    areas : (n,) float64
+        m²; they sum to the area of the surface, or of the polyhedron that stands for it.
+    primitives : (n,) int64
+        A face that the point lies on.
+    local_positions : (n, 3) float64
+        In the frame of the shape, where its attributes are looked up.
+    levels : (p, 2), nodes : (t,)
+        Patches as in `Patches`, with node indices local to this surface.
+    closed : bool
+        Whether the surface encloses a volume, so that its back is never seen.
+    counts : dict
+        Irregularities found: degenerate_faces, zero_normals, flipped_normals.
+    """
+
+    positions: np.ndarray
+    normals: np.ndarray
+    geometric_normals: np.ndarray
+    uv: np.ndarray
+    areas: np.ndarray
+    primitives: np.ndarray
+    local_positions: np.ndarray
+    levels: np.ndarray
+    nodes: np.ndarray
+    closed: bool
+    counts: dict
+
+
+def patch_levels(surface, edge_length):
+    """Levels (p, 2) of a surface's patches so that no edge of the lattice exceeds `edge_length` metres."""
+    if surface.kind == "mesh":
+        corners = _world_corners(surface)
+        longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).max(axis=1)
+        k = np.clip(np.ceil(longest / edge_length - 1e-6), 1, MAX_LEVEL).astype(np.int32)
+        return np.stack([k, np.zeros_like(k)], axis=-1)
+    along_u, along_v = _analytic_lengths(surface)
+    least = np.array(_LEAST_LEVELS[surface.kind])
+    wanted = np.ceil(np.array([along_u, along_v]) / edge_length - 1e-6)
+    return np.clip(wanted, least, MAX_LEVEL).astype(np.int32)[None]
+
+
+def tessellate(surface, edge_length):
+    """Points of a surface, see SurfacePoints.
+
+    Raises
+    ------
+    SceneError
+        If a mesh has positions that are NaN or infinite.
+    """
+    levels = patch_levels(surface, edge_length)
+    return _tessellate_mesh(surface, levels) if surface.kind == "mesh" else _tessellate_analytic(surface, levels)
+
+
+# --- meshes ------------------------------------------------------------------------------------------------------
+
+
+def _tessellate_mesh(surface, levels):
+    positions, faces, normals, uv = mesh_arrays(surface.shape)
+    if not np.isfinite(positions).all():
+        raise SceneError(f"mesh '{surface.name}' has positions that are NaN or infinite: repair it first")
+    world = _transformed(positions, surface.to_world)
+    face_normals, face_areas = _face_geometry(world, faces)
+    degenerate = face_areas <= 1e-12 * max(face_areas.max(initial=0.0), 1e-300)
+    sign = -1.0 if surface.shape.has_flipped_normals() else 1.0
+    if normals is None:
+        # A faceted mesh has one normal per face: split each vertex into one per distinct normal around it.
+        faces, source = _split_by_normal(faces, face_normals)
+        world, positions = world[source], positions[source]
+        uv = None if uv is None else uv[source]
+        normals = np.zeros_like(world)
+        normals[faces.ravel()] = np.repeat(sign * face_normals, 3, axis=0)
+    else:
+        normals = normals @ np.linalg.inv(surface.to_world[:3, :3])  # inverse transpose, for row vectors
+    uv = np.zeros((len(world), 2), np.float32) if uv is None else uv
+
+    face, barycentric, shares, identity = _mesh_nodes(faces, levels[:, 0], degenerate)
+    count = int(identity.max(initial=-1)) + 1
+    if count == 0 or degenerate.all():
+        raise SceneError(f"mesh '{surface.name}' has no face of positive area: remove it")
+    used = ~degenerate[face]
+    first = np.full(count, -1)
+    first[identity[used][::-1]] = np.flatnonzero(used)[::-1]
+
+    def at_points(values):
+        return np.einsum("nc,ncx->nx", barycentric[first], values[faces[face[first]]])
+
+    node_areas = shares * face_areas[face]
+    areas = np.bincount(identity[used], node_areas[used], count)
+    geometric = np.stack(
+        [np.bincount(identity[used], (node_areas * face_normals[face, x])[used], count) for x in range(3)], axis=-1
+    )
+    geometric = sign * _unit(geometric)
+    shading = at_points(normals)
+    zero = ~(np.linalg.norm(shading, axis=1) > 1e-8)  # also true for NaN
+    shading = np.where(zero[:, None], geometric, _unit(shading))
+    facing = np.sum(shading * geometric, axis=1)
+    order = _patch_order(levels[:, 0])
+    return SurfacePoints(
+        positions=at_points(world),
+        normals=shading,
+        geometric_normals=np.where(facing[:, None] < 0, -geometric, geometric),
+        uv=at_points(uv).astype(np.float32),
+        areas=areas,
+        primitives=face[first],
+        local_positions=at_points(positions),
+        levels=levels,
+        nodes=identity[order],
+        closed=_is_closed(positions, faces[~degenerate]),
+        counts={
+            "degenerate_faces": int(degenerate.sum()),
+            "zero_normals": int(zero.sum()),
+            "flipped_normals": int((facing < -0.1).sum()),
+        },
+    )
+
+
+def _mesh_nodes(faces, levels, degenerate):
+    """Nodes of all faces, grouped by level.
+
+    Returns the face (t,) and barycentric coordinates (t, 3) of each node, its share (t,) of the face's area (a third of
+    each small triangle that it is a corner of), and the identity (t,) of the point there.
+
+    Corners are the mesh's vertices, nodes inside an edge are shared by the faces of the same level along it. Vertices
+    that only degenerate faces use get no point; nodes of degenerate faces point anywhere (they can't be hit).
+    """
+    vertices = int(faces.max(initial=-1)) + 1
+    face_parts, barycentric_parts, share_parts, corner_parts, edge_parts = [], [], [], [], []
+    for k in np.unique(levels):
+        of_level = np.flatnonzero(levels == k)
+        i, j = lattice_nodes(k, 0).T
+        steps = np.stack([k - i - j, i, j], axis=-1)
+        f = np.repeat(of_level, len(steps))
+        steps = np.tile(steps, (len(of_level), 1))
+        zeros = (steps == 0).sum(axis=1)
+        face_parts.append(f)
+        barycentric_parts.append(steps / k)
+        triangles = lattice_triangles(k, 0)
+        share_parts.append(np.tile(np.bincount(triangles.ravel()) / 3 / len(triangles), len(of_level)))
+        corner_parts.append(np.where(zeros == 2, faces[f, steps.argmax(axis=1)], -1))
+        # An edge node is known by its end vertices in ascending order, the level, and the steps from the first.
+        opposite = steps.argmin(axis=1)
+        one, two = (opposite + 1) % 3, (opposite + 2) % 3
+        rows = np.arange(len(f))
+        v_one, v_two = faces[f, one], faces[f, two]
+        from_low = np.where(v_one < v_two, steps[rows, two], steps[rows, one])
+        key = np.stack([np.minimum(v_one, v_two) * vertices + np.maximum(v_one, v_two), k * (MAX_LEVEL + 1) + from_low], -1)
+        edge_parts.append(np.where((zeros == 1)[:, None], key, -1))
+    face, barycentric = np.concatenate(face_parts), np.concatenate(barycentric_parts)
+    corner, edge = np.concatenate(corner_parts), np.concatenate(edge_parts)
+
+    used = ~degenerate[face]
+    on_vertex, on_edge = used & (corner >= 0), used & (edge[:, 0] >= 0)
+    inside = used & ~on_vertex & ~on_edge
+    identity = np.zeros(len(face), np.int64)
+    vertex_ids, identity[on_vertex] = np.unique(corner[on_vertex], return_inverse=True)
+    edge_ids, inverse = np.unique(edge[on_edge], axis=0, return_inverse=True)
+    identity[on_edge] = len(vertex_ids) + inverse.ravel()
+    identity[inside] = len(vertex_ids) + len(edge_ids) + np.arange(inside.sum())
+    return face, barycentric, np.concatenate(share_parts), identity
+
+
+def _patch_order(levels):
+    """Where the nodes of `_mesh_nodes`, which are grouped by level, must go so that patches follow the faces' order."""
+    counts = node_count(levels, 0)
+    grouped = np.argsort(levels, kind="stable")  # the faces in the order of their groups
+    starts = np.empty(len(levels), np.int64)
+    starts[grouped] = np.cumsum(counts[grouped]) - counts[grouped]
+    return np.repeat(starts, counts) + np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+
+
+def _split_by_normal(faces, face_normals):
+    keys = np.round(face_normals * 4096).astype(np.int64) + 4097
+    packed = (keys[:, 0] * 8195 + keys[:, 1]) * 8195 + keys[:, 2]
+    corner_keys = np.stack([faces.ravel(), np.repeat(packed, 3)], axis=-1)
+    split, inverse = np.unique(corner_keys, axis=0, return_inverse=True)
+    return inverse.reshape(faces.shape), split[:, 0]
+
+
+def _world_corners(surface):
+    positions, faces, _, _ = mesh_arrays(surface.shape)
+    return _transformed(positions, surface.to_world)[faces]
+
+
+def _face_geometry(positions, faces):
+    a, b, c = positions[faces[:, 0]], positions[faces[:, 1]], positions[faces[:, 2]]
+    cross = np.cross(b - a, c - a)
+    return _unit(cross), np.linalg.norm(cross, axis=1) / 2
+
+
+def _is_closed(positions, faces):
+    """Whether every edge, welded by position, belongs to exactly two faces."""
+    welded = np.unique(positions, axis=0, return_inverse=True)[1].ravel()[faces]
+    edges = np.sort(np.concatenate([welded[:, [0, 1]], welded[:, [1, 2]], welded[:, [2, 0]]]), axis=1)
+    counts = np.unique(edges[:, 0] * (len(positions) + 1) + edges[:, 1], return_counts=True)[1]
+    return bool((counts == 2).all())
+
+
+# --- analytic shapes ---------------------------------------------------------------------------------------------
+
+
+def _tessellate_analytic(surface, levels):
+    nodes = lattice_nodes(*levels[0])
+    # Nodes on the seam and at the poles of a shape lie at one place: one point each.
+    last_u, last_v = levels[0]
+    i, j = nodes.T.copy()
+    if surface.kind in ("Sphere", "Cylinder"):
+        i[i == last_u] = 0
+    if surface.kind == "Sphere":
+        i[(j == 0) | (j == last_v)] = 0
+    if surface.kind == "Disk":
+        j[(j == last_v) | (i == 0)] = 0
+    _, first, identity = np.unique(j * (last_u + 1) + i, return_index=True, return_inverse=True)
+    uv = (nodes[first] / levels[0]).astype(np.float32)
+    local, normals = _evaluate(surface, uv)
+    world = _transformed(local, surface.to_world)
+    normals = _unit(normals @ np.linalg.inv(surface.to_world[:3, :3]))
+    triangles = identity[lattice_triangles(*levels[0])]
+    areas = np.bincount(triangles.ravel(), np.repeat(_face_geometry(world, triangles)[1] / 3, 3), len(first))
+    return SurfacePoints(
+        positions=world,
+        normals=normals,
+        geometric_normals=normals,
+        uv=uv,
+        areas=areas,
+        primitives=np.zeros(len(first), np.int64),
+        local_positions=local,
+        levels=levels,
+        nodes=identity,
+        closed=surface.kind == "Sphere",
+        counts={"degenerate_faces": 0, "zero_normals": 0, "flipped_normals": 0},
+    )
+
+
+def _evaluate(surface, uv):
+    """Positions and unit normals (k, 3) at the shape's own (u, v), in the frame of the shape or its group.
+
+    Mitsuba's parametrisations of the unit shapes, in closed form: its `eval_parameterization` misses the rims of
+    cylinders and forgets `flip_normals` of spheres.
+    """
+    u, v = uv.T.astype(np.float64)
+    if surface.kind == "Sphere":
+        local = _on_circle(u, np.sin(np.pi * v), np.cos(np.pi * v))
+        normals = local
+    elif surface.kind == "Cylinder":
+        local = _on_circle(u, 1.0, v)
+        normals = _on_circle(u, 1.0, np.zeros_like(v))
+    else:
+        local = _on_circle(v, u, np.zeros_like(u))
+        normals = np.broadcast_to([0.0, 0.0, 1.0], local.shape)
+    to_world = transform_of(surface.shape)
+    normals = _unit(normals @ np.linalg.inv(to_world[:3, :3]))
+    return _transformed(local, to_world), -normals if surface.shape.has_flipped_normals() else normals
+
+
+def _on_circle(turn, radius, height):
+    phi = 2 * np.pi * turn
+    return np.stack([radius * np.cos(phi), radius * np.sin(phi), height], axis=-1)
+
+
+def _analytic_lengths(surface):
+    """Longest extents (u, v) of the shape along its parameters, in metres."""
+    side = 33
+    grid = np.stack(np.meshgrid(np.linspace(0, 1, side), np.linspace(0, 1, side)), axis=-1).reshape(-1, 2)
+    local, _ = _evaluate(surface, grid)
+    world = _transformed(local, surface.to_world).reshape(side, side, 3)
+    along_u = np.linalg.norm(np.diff(world, axis=1), axis=-1).sum(axis=1).max()
+    along_v = np.linalg.norm(np.diff(world, axis=0), axis=-1).sum(axis=0).max()
+    return along_u, along_v
+
+
+def _transformed(positions, to_world):
+    return positions.astype(np.float64) @ to_world[:3, :3].T + to_world[:3, 3]
+
+
+def _unit(vectors):
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0)

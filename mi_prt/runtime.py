@@ -1,0 +1,278 @@
+"""The one door to Mitsuba: variant, threads, kernel counts, versions, memory, and the OpenGL platform.
+
+Mitsuba and Dr.Jit are imported inside these functions and nowhere at import time, so that `mi-prt --help` answers at
+once and a machine without a usable LLVM gets a typed error instead of an ended process.
+"""
+
+import ctypes
+import importlib.metadata
+import os
+import platform
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from ctypes.util import find_library
+from functools import cache
+from types import ModuleType
+
+from .errors import RuntimeSetupError, SettingsError
+from .llvm import install_command, require_llvm, select_llvm
+
+VARIANTS = ("cuda_ad_rgb", "llvm_ad_rgb")
+"""Mitsuba variants that mi_prt works in, the preferred one first."""
+
+THREADS_PER_CORE = 8
+"""Most threads per core that `set_threads` accepts: more only costs memory."""
+
+PACKAGES = ("mi_prt", "mitsuba", "drjit", "numpy", "scipy", "h5py")
+"""Distributions whose versions are stored with every result."""
+
+RASTER_LIBRARIES = {"osmesa": "OSMesa", "egl": "EGL"}
+"""Libraries that draw without a screen, by their name in `PYOPENGL_PLATFORM`, the preferred one first."""
+
+_RASTER_PACKAGES = {
+    "apt-get": "libosmesa6",
+    "dnf": "mesa-libEGL mesa-dri-drivers",
+    "zypper": "Mesa-libEGL1 Mesa-dri",
+    "pacman": "mesa libglvnd",
+}
+
+
+def mitsuba() -> ModuleType:
+    """The `mitsuba` module with a usable variant set.
+
+    A variant of `VARIANTS` that is already set is kept. Without one, `cuda_ad_rgb` is set where Dr.Jit finds a GPU
+    and OptiX, else `llvm_ad_rgb`.
+
+    Raises
+    ------
+    RuntimeSetupError
+        If another variant is set, or if the LLVM variant is the one to use and there is no usable LLVM.
+    """
+    select_llvm()
+    import mitsuba as mi
+
+    variant = mi.variant()
+    if variant is None:
+        variant = "cuda_ad_rgb" if cuda_usable() else "llvm_ad_rgb"
+    if variant not in VARIANTS:
+        raise RuntimeSetupError(f"the Mitsuba variant {variant} is set, but mi_prt works in {' or '.join(VARIANTS)}; "
+                                f"call mitsuba.set_variant('llvm_ad_rgb') instead, or leave the choice to mi_prt")
+    if variant.startswith("llvm"):
+        require_llvm()
+    if mi.variant() is None:
+        mi.set_variant(variant)
+    return mi
+
+
+def cuda_usable() -> bool:
+    """Whether Dr.Jit finds a GPU and, for tracing rays, OptiX: containers often pass on the first without the second."""
+    select_llvm()
+    import drjit as dr
+    import mitsuba as mi
+
+    return "cuda_ad_rgb" in mi.variants() and bool(dr.has_backend(dr.JitBackend.CUDA)) and _optix_loadable()
+
+
+def quiet_mitsuba() -> None:
+    """Send Mitsuba's messages of level Warn and above to stderr, and drop the rest and its progress bars.
+
+    Mitsuba logs to stdout, which belongs to the results of a program. Messages may come from its worker threads.
+    """
+    select_llvm()
+    import mitsuba as mi
+
+    class StderrAppender(mi.Appender):
+        def append(self, level, text):
+            print(text, file=sys.stderr)
+
+        def log_progress(self, progress, name, formatted, eta, ptr=None):
+            pass
+
+    logger = mi.logger()
+    logger.clear_appenders()
+    logger.add_appender(StderrAppender())
+    logger.set_log_level(mi.LogLevel.Warn)
+
+
+def set_threads(count: int) -> None:
+    """Set how many CPU threads Mitsuba and Dr.Jit use, the calling thread included.
+
+    Parameters
+    ----------
+    count : int
+        Between 1 and `THREADS_PER_CORE` times the number of cores.
+
+    Raises
+    ------
+    SettingsError
+        If `count` is not an integer in this range.
+    """
+    most = THREADS_PER_CORE * (os.cpu_count() or 1)
+    if isinstance(count, bool) or not isinstance(count, int) or not 1 <= count <= most:
+        raise SettingsError(f"threads must be an integer from 1 to {most} ({THREADS_PER_CORE} per core), got {count!r}")
+    select_llvm()
+    import drjit as dr
+
+    dr.set_thread_count(count)
+
+
+def thread_count() -> int:
+    """How many CPU threads Mitsuba and Dr.Jit use, the calling thread included."""
+    select_llvm()
+    import drjit as dr
+
+    return dr.thread_count()
+
+
+class KernelCount:
+    """Kernels of Dr.Jit since this object was made, until `stop`.
+
+    Dr.Jit's own running totals are compared, so nothing is recorded and memory stays constant over long runs.
+    """
+
+    def __init__(self):
+        self._start = _launch_totals()
+        self._end = None
+
+    @property
+    def launched(self) -> int:
+        """Kernels launched."""
+        return self._since_start(0)
+
+    @property
+    def compiled(self) -> int:
+        """Kernels new to this process: compiled, or loaded from Dr.Jit's cache on disk. Repeating one adds nothing."""
+        return self._since_start(1) + self._since_start(2)
+
+    @property
+    def from_disk(self) -> int:
+        """How many of `compiled` came from the cache on disk."""
+        return self._since_start(1)
+
+    def stop(self) -> None:
+        """Keep the present counts for good."""
+        self._end = _launch_totals()
+
+    def _since_start(self, total: int) -> int:
+        return (self._end or _launch_totals())[total] - self._start[total]
+
+
+@contextmanager
+def count_kernels() -> Iterator[KernelCount]:
+    """Count the kernels of Dr.Jit within a ``with`` block; blocks may be nested, and counts be read inside and after.
+
+    Only what is evaluated within the block counts: end it with `drjit.eval`. A function that compiles at each call
+    has a literal in it that should be `drjit.opaque`.
+
+    Examples
+    --------
+    >>> with count_kernels() as kernels:
+    ...     drjit.eval(drjit.arange(mi.Float, 8) + 1)
+    >>> kernels.launched, kernels.compiled
+    (1, 1)
+    """
+    count = KernelCount()
+    try:
+        yield count
+    finally:
+        count.stop()
+
+
+def peak_memory_bytes() -> int:
+    """Largest resident memory of this process so far, in bytes."""
+    try:
+        with open("/proc/self/status") as file:
+            # getrusage would also count the parent's memory at the time it started this process.
+            return next(int(line.split()[1]) * 1024 for line in file if line.startswith("VmHWM"))
+    except (OSError, StopIteration):
+        import resource
+
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        return peak if sys.platform == "darwin" else peak * 1024
+
+
+def versions() -> dict[str, str]:
+    """Versions of `PACKAGES`, Python, and the LLVM that Dr.Jit runs with ("none" where something is absent)."""
+    found = {package: _package_version(package) for package in PACKAGES}
+    return found | {"python": platform.python_version(), "llvm": _llvm_version()}
+
+
+def raster_platform() -> str:
+    """Choose how pyrender opens OpenGL without a screen, by setting `PYOPENGL_PLATFORM`; call it before using pyrender.
+
+    A variable that is already set is kept. Else OSMesa is taken if its library is installed, because it needs no
+    driver and draws the same everywhere, else EGL.
+
+    Returns
+    -------
+    str
+        "osmesa" or "egl".
+
+    Raises
+    ------
+    RuntimeSetupError
+        If neither library is installed, if the variable names another platform or one that is not installed, or if
+        PyOpenGL was imported before with another platform.
+    """
+    installed = [name for name, library in RASTER_LIBRARIES.items() if _installed(library)]
+    chosen = os.environ.get("PYOPENGL_PLATFORM") or next(iter(installed), None)
+    if chosen is None:
+        raise RuntimeSetupError("neither OSMesa nor EGL is installed, one of which draws without a screen; install it "
+                                f"with `{raster_install_command()}`")
+    if chosen not in installed:
+        raise RuntimeSetupError(f"PYOPENGL_PLATFORM is {chosen}, but what draws without a screen here is "
+                                f"{' or '.join(installed) or 'nothing'}; unset it, or install a platform with "
+                                f"`{raster_install_command()}`")
+    loaded = sys.modules.get("OpenGL.platform")
+    name = type(loaded.PLATFORM).__name__ if loaded else ""
+    if loaded and not name.lower().startswith(chosen):
+        raise RuntimeSetupError(f"PyOpenGL was imported before mi_prt and took {name}, but {chosen} is needed; import "
+                                f"OpenGL and pyrender after mi_prt, or start with PYOPENGL_PLATFORM={chosen}")
+    os.environ["PYOPENGL_PLATFORM"] = chosen
+    return chosen
+
+
+def raster_install_command() -> str:
+    """What to type to install a library that draws without a screen."""
+    return install_command(_RASTER_PACKAGES)
+
+
+@cache
+def _installed(library: str) -> bool:
+    """Whether the dynamic linker knows a library; asked once, because it takes a process."""
+    return find_library(library) is not None
+
+
+def _optix_loadable() -> bool:
+    """Whether the driver's OptiX library can be loaded; only Linux splits it from the rest of the driver."""
+    if sys.platform != "linux":
+        return True
+    try:
+        ctypes.CDLL("libnvoptix.so.1")
+    except OSError:
+        return False
+    return True
+
+
+def _launch_totals() -> tuple[int, int, int]:
+    """Kernels launched, loaded from disk, and compiled since Dr.Jit was imported."""
+    select_llvm()
+    import drjit as dr
+
+    return dr.detail.launch_stats()
+
+
+def _package_version(package: str) -> str:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return "none"
+
+
+def _llvm_version() -> str:
+    select_llvm()
+    import drjit as dr
+
+    version = dr.detail.llvm_version()
+    return ".".join(map(str, version)) if version[0] > 0 else "none"

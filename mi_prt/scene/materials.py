@@ -1,0 +1,121 @@
+"""What of a material the transport models: its diffuse reflection. The rest is named, not dropped in silence."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..runtime import mitsuba
+from .traversal import children
+
+# Class names of Mitsuba's materials, and the texture that holds their diffuse albedo.
+_DIFFUSE_TEXTURE = {
+    "SmoothPlastic": "diffuse_reflectance",
+    "RoughPlastic": "diffuse_reflectance",
+    "Principled": "base_color",
+    "PrincipledThin": "base_color",
+}
+_LEFT_OUT = {
+    "SmoothPlastic": "specular coat",
+    "RoughPlastic": "glossy coat",
+    "Principled": "specular, sheen, clearcoat and transmission lobes",
+    "PrincipledThin": "specular, sheen and transmission lobes",
+    "BumpMap": "bumps",
+    "NormalMap": "normal map",
+    "MaskBSDF": "opacity (treated as opaque)",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Material:
+    """A BSDF and its diffuse model.
+
+    Parameters
+    ----------
+    bsdf : mi.BSDF
+        As written.
+    modelled : mi.BSDF
+        Diffuse parts only; the same object where nothing is left out.
+    two_sided : bool
+        Whether the back of the surface reflects too.
+    textured : bool
+        Whether the reflectance varies over the surface.
+    left_out : tuple of str
+        What is not modelled, for example "conductor: all of its reflection".
+    """
+
+    bsdf: object
+    modelled: object
+    two_sided: bool
+    textured: bool
+    left_out: tuple
+
+    def left_out_albedo(self, samples=4096, seed=0):
+        """Share of light at 45° that the material scatters in ways that are left out, averaged over uv, 0…1."""
+        if not self.left_out:
+            return 0.0
+        import drjit as dr
+
+        mi = mitsuba()
+        sampler = mi.load_dict({"type": "independent"})
+        sampler.seed(seed, samples)
+        si = dr.zeros(mi.SurfaceInteraction3f, samples)
+        si.t = 1.0
+        si.n = si.sh_frame.n = mi.Normal3f(0, 0, 1)
+        si.sh_frame.s, si.sh_frame.t = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)
+        si.dp_du, si.dp_dv = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)
+        si.uv = sampler.next_2d()
+        si.wi = mi.Vector3f(np.sqrt(0.5), 0, np.sqrt(0.5))
+        _, weight = self.bsdf.sample(mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d())
+        scattered = float(np.mean(np.array(weight)))
+        diffuse = float(np.mean(np.array(self.modelled.eval_diffuse_reflectance(si))))
+        return float(np.clip(scattered - diffuse, 0.0, 1.0))
+
+
+def model_material(bsdf):
+    """Diffuse model of a BSDF, see Material."""
+    mi = mitsuba()
+    left_out = []
+    modelled = _model(bsdf, left_out)
+    two_sided = mi.has_flag(modelled.flags(), mi.BSDFFlags.BackSide)
+    textured = any(key.endswith((".data", "color0.value")) or "vertex_" in key for key in mi.traverse(modelled).keys())
+    textured = textured or mi.has_flag(modelled.flags(), mi.BSDFFlags.SpatiallyVarying)
+    return Material(bsdf, modelled, two_sided, textured, tuple(dict.fromkeys(left_out)))
+
+
+def _model(bsdf, left_out):
+    mi = mitsuba()
+    kind = bsdf.class_name()
+    below = children(bsdf)
+    if kind == "SmoothDiffuse":
+        return bsdf
+    if kind in ("TwoSidedBRDF", "BlendBSDF"):
+        nested = [c for name, c in below if isinstance(c, mi.BSDF)]
+        modelled = [_model(c, left_out) for c in nested]
+        if all(a is b for a, b in zip(nested, modelled)):
+            return bsdf
+        if kind == "TwoSidedBRDF":
+            # What has a back already (glass, a nested twosided) needs no second one.
+            if any(mi.has_flag(m.flags(), mi.BSDFFlags.BackSide) for m in modelled):
+                return modelled[0]
+            return mi.load_dict({"type": "twosided", **{f"side{i}": m for i, m in enumerate(modelled)}})
+        weight = dict(below)["weight"]
+        return mi.load_dict({"type": "blendbsdf", "weight": weight, "first": modelled[0], "second": modelled[1]})
+    if kind in ("BumpMap", "NormalMap", "MaskBSDF"):
+        left_out.append(f"{kind}: {_LEFT_OUT[kind]}")
+        return _model(next(c for _, c in below if isinstance(c, mi.BSDF)), left_out)
+    if kind in _DIFFUSE_TEXTURE:
+        left_out.append(f"{kind}: {_LEFT_OUT[kind]}")
+        textures = dict(below)
+        diffuse = mi.load_dict({"type": "diffuse", "reflectance": textures[_DIFFUSE_TEXTURE[kind]]})
+        for share in ("metallic", "spec_trans"):
+            if share in textures:  # that share of the surface has no diffuse lobe
+                diffuse = mi.load_dict(
+                    {"type": "blendbsdf", "weight": textures[share], "first": diffuse, "second": _black()}
+                )
+        return diffuse
+    left_out.append(f"{kind}: all of its scattering (treated as black)")
+    return _black()
+
+
+def _black():
+    return mitsuba().load_dict({"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}})

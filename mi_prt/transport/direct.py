@@ -1,0 +1,191 @@
+"""Direct transport T_ij = V·max(0, n·ω) (Eigentransport, eq. 1), sampled by ray queries and kept as visibility bits."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..runtime import mitsuba
+
+LANES = 1 << 22  # rays of a wavefront: a few million keep both cores busy in a few hundred MB
+RAY_OFFSET = 2e-5  # share of the scene's scale by which rays start off the surface
+BURIED_RAYS = 64
+
+
+@dataclass(frozen=True, eq=False)
+class DirectTransport:
+    """The sampled transport matrix, one bit for every ray.
+
+    T is visibility times a cosine that normals and directions give back, so bits are all that must be stored: 32
+    times less than float32.
+
+    Parameters
+    ----------
+    normals : (n, 3) float32
+    vectors : (s, r, 3) float32
+        The r directions sampled in each cell.
+    fractions : (s, r) float32
+        Share of the cell's solid angle that each stands for.
+    bits : (n, ceil(s·r/8)) uint8
+        Visibility, packed along directions; a ray below the horizon counts as blocked.
+    rays : int
+        Rays traced (those above the horizon).
+    """
+
+    normals: np.ndarray
+    vectors: np.ndarray
+    fractions: np.ndarray
+    bits: np.ndarray
+    rays: int
+
+    @property
+    def shape(self):
+        """(n, s)."""
+        return len(self.normals), len(self.vectors)
+
+    def rows(self, index):
+        """Rows of the transport matrix.
+
+        Parameters
+        ----------
+        index : slice or (b,) array
+
+        Returns
+        -------
+        (b, s) float32
+            Irradiance per unit radiance of each cell, per steradian.
+        """
+        s, r, _ = self.vectors.shape
+        visible = np.unpackbits(self.bits[index], axis=1, count=s * r)
+        cosines = self.normals[index] @ self.vectors.reshape(-1, 3).T
+        np.maximum(cosines, 0, out=cosines)
+        cosines *= visible
+        if r == 1:
+            return cosines
+        return np.einsum("bsr,sr->bs", cosines.reshape(-1, s, r), self.fractions)
+
+    def blocks(self, size=2048):
+        """All rows in order, `size` at a time."""
+        for first in range(0, len(self.normals), size):
+            yield self.rows(slice(first, first + size))
+
+    def irradiance(self, radiance, solid_angles):
+        """Irradiance (n, 3) under cell radiance (s, 3): what no basis has touched."""
+        weighted = (radiance * solid_angles[:, None]).astype(np.float32)
+        return np.concatenate([block @ weighted for block in self.blocks()])
+
+
+def sample_direct(scene, points, directions, rays_per_direction=1, progress=lambda done, total: None):
+    """Trace the direct transport of all points.
+
+    Parameters
+    ----------
+    scene : Scene
+    points : Points
+    directions : Cubemap
+    rays_per_direction : int
+        Rays in each cell; more of them antialias visibility.
+    progress : callable(done, total)
+        Called after every block of points.
+
+    Returns
+    -------
+    DirectTransport
+    """
+    vectors, fractions = directions.subdivided(rays_per_direction)
+    tracer = VisibilityTracer(scene, points, vectors.reshape(-1, 3))
+    step = max(1, LANES // tracer.count)
+    packed = []
+    for first in range(0, len(points), step):
+        size = min(step, len(points) - first)
+        packed.append(np.packbits(tracer.trace(first, size), axis=1))
+        progress(first + size, len(points))
+    return DirectTransport(points.normals, vectors, fractions, np.concatenate(packed), tracer.rays)
+
+
+class VisibilityTracer:
+    """Occlusion rays from points into fixed directions, in blocks that share one kernel.
+
+    Everything that changes from block to block is opaque to the compiler; literals would compile a kernel each.
+    """
+
+    def __init__(self, scene, points, vectors):
+        import drjit as dr
+
+        mi = mitsuba()
+        self.occluders = scene.occluders
+        self.count = len(vectors)
+        self.rays = 0
+        self._offset = dr.opaque(mi.Float, RAY_OFFSET * scene.scale)
+        self._vectors = mi.Float(vectors.ravel())
+        self._normals = mi.Float(points.normals.ravel())
+        self._geometric_normals = mi.Float(points.geometric_normals.ravel())
+        self._positions = mi.Float(points.positions.ravel())
+
+    def block(self, first, size):
+        """The rays of points first…first+size, point by point, and which of them lie above the horizon."""
+        import drjit as dr
+
+        mi = mitsuba()
+        lane = dr.arange(mi.UInt32, size * self.count)
+        count = dr.opaque(mi.UInt32, self.count)
+        local = lane // count
+        point = local + dr.opaque(mi.UInt32, first)
+        direction = dr.gather(mi.Vector3f, self._vectors, lane - local * count)
+        normal = dr.gather(mi.Vector3f, self._normals, point)
+        above = dr.dot(normal, direction) > 0
+        # Rays start on the side of the surface that reflects. One that dips below the faces around its vertex (the
+        # hemisphere of a smooth normal can) runs into them and is blocked, as it is in Mitsuba's own rendering.
+        origin = dr.gather(mi.Point3f, self._positions, point)
+        origin += self._offset * dr.gather(mi.Vector3f, self._geometric_normals, point)
+        return mi.Ray3f(origin, direction), above
+
+    def trace(self, first, size):
+        """Visibility (size, directions) bool of a block of points."""
+        import drjit as dr
+
+        ray, above = self.block(first, size)
+        visible = above & ~self.occluders.ray_test(ray, False, above)
+        dr.eval(visible, above)
+        self.rays += int(dr.count(above)[0])
+        return np.array(visible).reshape(size, self.count)
+
+
+def find_buried(scene, points, dark):
+    """Which points without any sky lie inside or against other geometry.
+
+    A point is buried when every ray of its hemisphere ends on the back of a face or nearer than 1e-3 of the scene's
+    scale: feet below the ground, a floor under a box. A dark corner, which other light may reach, is not.
+
+    Parameters
+    ----------
+    scene : Scene
+    points : Points
+    dark : (n,) bool
+        Points that see no direction of the sky.
+
+    Returns
+    -------
+    (n,) bool
+    """
+    import drjit as dr
+
+    mi = mitsuba()
+    buried = np.zeros(len(points), bool)
+    index = np.flatnonzero(dark)
+    if not len(index):
+        return buried
+    # A fixed spherical Fibonacci set, flipped into each hemisphere.
+    z = 1 - (np.arange(BURIED_RAYS) + 0.5) * 2 / BURIED_RAYS
+    phi = np.arange(BURIED_RAYS) * np.pi * (3 - 5**0.5)
+    vectors = np.stack([np.sqrt(1 - z * z) * np.cos(phi), np.sqrt(1 - z * z) * np.sin(phi), z], axis=-1).astype(np.float32)
+    step = LANES // BURIED_RAYS
+    for chunk in np.split(index, range(step, len(index), step)):
+        normals = np.repeat(points.normals[chunk], BURIED_RAYS, axis=0)
+        toward = np.tile(vectors, (len(chunk), 1))
+        toward *= np.where(np.sum(toward * normals, axis=1) < 0, -1, 1)[:, None].astype(np.float32)
+        origins = points.positions[chunk] + RAY_OFFSET * scene.scale * points.geometric_normals[chunk]
+        ray = mi.Ray3f(mi.Point3f(np.repeat(origins, BURIED_RAYS, axis=0).T), mi.Vector3f(toward.T))
+        hit = scene.occluders.ray_intersect(ray)
+        inside = hit.is_valid() & ((dr.dot(hit.n, ray.d) > 0) | (hit.t < 1e-3 * scene.scale))
+        buried[chunk] = np.array(inside).reshape(len(chunk), BURIED_RAYS).all(axis=1)
+    return buried
