@@ -11,8 +11,8 @@ cd "$(dirname "${BASH_SOURCE[0]}")"
 
 venv=.venv
 pythons=(python3 python3.13 python3.12 python3.14 python3.11)
-llvms=(libllvm22 libllvm19 libllvm21 libllvm20 libllvm18 libllvm17t64 libllvm17)
-egl=(libegl1 libgl1 libopengl0 libgl1-mesa-dri)
+llvms=(libllvm22 libllvm21 libllvm20 libllvm19 libllvm18 libllvm17t64 libllvm17)
+egl=(libegl1 libopengl0 libgl1-mesa-dri)
 installer=unknown
 updated=no
 
@@ -39,10 +39,14 @@ can_install() {
 apt() {
     local prefix=()
     [ "$installer" = root ] || prefix=(sudo)
-    "${prefix[@]}" env DEBIAN_FRONTEND=noninteractive apt-get -q -o DPkg::Lock::Timeout=300 "$@" >&2
+    "${prefix[@]}" env DEBIAN_FRONTEND=noninteractive apt-get -qq -o DPkg::Lock::Timeout=300 "$@" >/dev/null
 }
 
-apt_offers() { LC_ALL=C apt-cache policy "$1" 2>/dev/null | grep -q 'Candidate: [^(]'; }
+apt_offers() {
+    local version
+    version=$(LC_ALL=C apt-cache policy "$1" | sed -n 's/ *Candidate: //p')
+    [ -n "$version" ] && [ "$version" != "(none)" ]
+}
 
 # Prints those of the packages that apt offers.
 apt_offered() {
@@ -97,7 +101,7 @@ make_venv() {
     local python name
     if ! python=$(find_python); then
         [ -z "${PYTHON:-}" ] || fail "PYTHON=$PYTHON is not a Python from 3.11 to 3.14"
-        say "no Python from 3.11 to 3.14 is here ($(python3 --version 2>&1 || true))"
+        say "no Python from 3.11 to 3.14 is here ($(python3 --version 2>/dev/null || echo "no python3 at all"))"
         apt_install first python3.13 python3.12 python3.11 || true
         python=$(find_python) || fail "install Python 3.11 to 3.14, for example with" \
             "\`sudo apt-get install python3.11 python3.11-venv\` or from https://www.python.org/downloads," \
@@ -114,22 +118,33 @@ make_venv() {
     "$python" -m venv --clear "$venv"
 }
 
-# Whether mi_prt's own examination finds the rays or the raster in order; prints the fault and its remedy if not.
+# Whether mi_prt's own examination finds the rays or the raster in order; keeps what it advises if not.
 works() {
-    "$venv/bin/python" - "$1" <<'EOF'
+    advice=$("$venv/bin/python" - "$1" 2>&1 <<'EOF'
 import sys
 from mi_prt import doctor
 
 check = getattr(doctor, f"check_{sys.argv[1]}")()
 if check.status == "fault":
-    sys.exit(f"setup: {check.value}\nsetup: {check.remedy}")
+    sys.exit(f"{check.value}\nsetup: {check.remedy}")
 EOF
+    )
 }
 
-# A library that the user chose by a variable is not ours to replace.
+loads() { "$venv/bin/python" -c "import ctypes; ctypes.CDLL('$1')" 2>/dev/null; }
+
+# Slim images lack libatomic, which Dr.Jit needs. A library that the user chose by a variable is not ours to replace.
 provide_rays() {
     works rays && return
-    [ -z "${DRJIT_LIBLLVM_PATH:-}" ] && apt_install first "${llvms[@]}" && works rays
+    if ! loads libatomic.so.1 && apt_install first libatomic1; then
+        works rays && return
+    fi
+    [ -z "${DRJIT_LIBLLVM_PATH:-}" ] && can_install || return 1
+    if ! apt_install first "${llvms[@]}"; then
+        advice+=$'\n'"setup: if this release has none of them, add LLVM's own packages first: https://apt.llvm.org"
+        return 1
+    fi
+    works rays
 }
 
 provide_raster() {
@@ -145,7 +160,7 @@ if ! { usable_python "$venv/bin/python" && "$venv/bin/python" -m pip --version >
 fi
 say "installing the Python packages into $venv (the first time this takes a minute or two)"
 "$venv/bin/python" -m pip install --quiet --disable-pip-version-check -e '.[test]'
-provide_rays || fail "Mitsuba cannot render yet: follow the advice above, then run make again"
-provide_raster || fail "OpenGL cannot draw without a screen yet: follow the advice above, then run make again"
+provide_rays || fail "$advice"$'\n'"setup: do this, then run make again: Mitsuba cannot render yet"
+provide_raster || fail "$advice"$'\n'"setup: do this, then run make again: nothing draws without a screen yet"
 pwd -P >"$venv/.ready"
 say "done"

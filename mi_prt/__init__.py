@@ -13,7 +13,6 @@ from .llvm import select_llvm
 
 select_llvm()  # before anything can load Dr.Jit: an LLVM that is too old would end the process
 
-from . import plugin  # noqa: E402
 from .asset import Asset, load  # noqa: E402
 from .errors import (  # noqa: E402
     AssetError,
@@ -27,6 +26,7 @@ from .errors import (  # noqa: E402
 from .lighting.environment import EnvironmentMap, LightWarning  # noqa: E402
 from .lighting.light import DirectionalLight, DistantLight  # noqa: E402
 from .precompute import precompute  # noqa: E402
+from .render.integrator import register_integrator  # noqa: E402
 
 __version__ = "0.1.0"
 __all__ = [
@@ -46,4 +46,4 @@ __all__ = [
     "precompute",
 ]
 
-plugin.register()
+register_integrator()

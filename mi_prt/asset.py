@@ -7,6 +7,7 @@ import json
 import os
 import tempfile
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -100,10 +101,15 @@ class Asset:
 
     def relight(self, light):
         """Outgoing radiance B = ρ/π · E at the points, (n, 3) float32 in W/(m²·sr). See `project_light` for `light`."""
-        irradiance = self.irradiance(light)
-        irradiance *= self.points.albedo
-        irradiance *= 1 / np.pi
-        return irradiance
+        return self.outgoing_radiance(self.irradiance(light))
+
+    def outgoing_radiance(self, irradiance):
+        """Outgoing radiance B = ρ/π · E (n, 3) of irradiance (n, 3) at the points."""
+        return irradiance * self._reflection
+
+    @cached_property
+    def _reflection(self):
+        return self.points.albedo * np.float32(1 / np.pi)
 
     def transport(self, rows):
         """Transport (len(rows), s) float32 as the basis reconstructs it; `rows` indexes points."""

@@ -38,15 +38,14 @@ print(json.dumps({"variant": mi.variant(), "distance": float(hit.t[0]), "threads
 _RASTER_PROBE = """
 import json
 from mi_prt import runtime
-platform = runtime.raster_platform()
-import pyrender
+pyrender = runtime.pyrender()
 renderer = pyrender.OffscreenRenderer(16, 16)
 from OpenGL.GL import GL_RENDERER, glGetString
 driver = glGetString(GL_RENDERER).decode()
 scene = pyrender.Scene(bg_color=[1.0, 1.0, 1.0, 1.0])
 scene.add(pyrender.PerspectiveCamera(yfov=1.0))
 color, _ = renderer.render(scene)
-print(json.dumps({"platform": platform, "driver": driver, "background": int(color.min())}))
+print(json.dumps({"platform": runtime.raster_platform(), "driver": driver, "background": int(color.min())}))
 """
 
 
@@ -81,7 +80,8 @@ def examine() -> list[Check]:
         Python, each package, LLVM, rays (variant, Embree, threads, CUDA) and raster.
     """
     rays, complaint = _probe(_RAYS_PROBE)
-    checks = [Check("python", "ok", f"{platform.python_version()} ({sys.executable})")]
+    checks = [Check("python", "ok", f"{platform.python_version()} ({sys.executable})"),
+              Check("mi_prt", "ok", runtime.package_version("mi_prt"))]
     checks += [_package(requirement) for requirement in _requirements()]
     checks += [_llvm(rays), _other_llvm(), _rays(rays, complaint)]
     if rays:
@@ -142,11 +142,11 @@ def _fault(name: str, complaint: str, otherwise: str) -> Check:
 
 
 def _requirements() -> list[Requirement]:
-    """What mi_prt's own metadata says it needs, optional extras left out; nothing if it runs without being installed."""
+    """What mi_prt's metadata says it needs, optional extras left out; names alone if it is run without installation."""
     try:
         lines = importlib.metadata.requires("mi_prt") or []
     except importlib.metadata.PackageNotFoundError:
-        return []
+        lines = [package for package in runtime.PACKAGES if package != "mi_prt"]
     requirements = [Requirement(line) for line in lines]
     return [need for need in requirements if need.marker is None or need.marker.evaluate({"extra": ""})]
 
@@ -154,9 +154,8 @@ def _requirements() -> list[Requirement]:
 def _package(need: Requirement) -> Check:
     """Whether a required package is installed in a version within its bounds."""
     remedy = f"{sys.executable} -m pip install '{need}'"
-    try:
-        version = importlib.metadata.version(need.name)
-    except importlib.metadata.PackageNotFoundError:
+    version = runtime.package_version(need.name)
+    if version == "none":
         return Check(need.name, "fault", "not installed", remedy)
     if version not in need.specifier:
         return Check(need.name, "fault", f"{version}, but {need.specifier} is needed", remedy)
@@ -180,7 +179,8 @@ def _llvm(rays: dict) -> Check:
 
 def _other_llvm() -> Check:
     """LLVM libraries that are there but not used, as information."""
-    others = [library for library in llvm.find_libraries() if library.path != os.path.realpath(llvm.select_llvm() or "")]
+    used = os.path.realpath(llvm.select_llvm() or "")
+    others = [library for library in llvm.find_libraries() if library.path != used]
     named = [f"{library.version or 'unknown'} ({library.path}){'' if library.usable else ' unusable'}"
              for library in others]
     return Check("other llvm", "ok", ", ".join(named) or "none")

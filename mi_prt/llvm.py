@@ -22,8 +22,8 @@ VARIABLE = "DRJIT_LIBLLVM_PATH"
 OLDEST_VERSION = 17
 """Oldest usable major version: 14 is refused by Dr.Jit, 15 and 16 end the process inside the path integrator."""
 
-TRIED_VERSIONS = (22, 19)
-"""Major versions that mi_prt was run with, preferred in this order; other usable versions come after them."""
+NEWEST_TRIED = 22
+"""Newest major version that Mitsuba was run with; later ones are taken only where there is no other."""
 
 DIRECTORIES = (
     "/usr/lib/llvm-*/lib",  # Debian, Ubuntu, apt.llvm.org
@@ -41,7 +41,7 @@ DIRECTORIES = (
 """Where packages put libLLVM, as glob patterns."""
 
 _LIBRARY_NAME = re.compile(r"libLLVM(-\d+(\.\d+)*)?(\.\d+(\.\d+)*)?\.(dylib|so(\.\d+)*)")
-_VERSION_IN_NAME = re.compile(r"libLLVM(?:-|\.so\.|\.)(\d+)")
+_VERSION_IN_NAME = re.compile(r"libLLVM(?:-|\.(?:so\.)?(?=\d\d))(\d+)")  # but libLLVM.so.1 tells nothing
 _VERSION_IN_FOLDER = re.compile(r"/llvm[-@/]?(\d+)")
 
 _PACKAGES = {
@@ -123,7 +123,8 @@ def find_libraries(directories: list[str] | None = None) -> list[Library]:
     Returns
     -------
     list of Library
-        Usable ones first (`TRIED_VERSIONS`, then the newest), then those of unknown version, then too old ones.
+        Usable ones first (newest first up to `NEWEST_TRIED`, then later ones), then those of unknown version, then
+        too old ones.
     """
     if directories is not None:
         return _ranked(_in_directories(directories))
@@ -169,7 +170,7 @@ def remedy() -> str:
     usable = next((library.path for library in find_libraries() if library.usable), None)
     if usable is not None:
         return f"{usable} is usable: unset {VARIABLE}, or set it to that"
-    return (f"install LLVM {OLDEST_VERSION} to {TRIED_VERSIONS[0]} with `{install_command(_PACKAGES)}`, or set "
+    return (f"install LLVM {OLDEST_VERSION} to {NEWEST_TRIED} with `{install_command(_PACKAGES)}`, or set "
             f"{VARIABLE} to the path of its libLLVM")
 
 
@@ -237,8 +238,8 @@ def _ranked(libraries: list[Library]) -> list[Library]:
     """Each file once, the best first."""
 
     def rank(library: Library) -> tuple:
-        tried = TRIED_VERSIONS.index(library.version) if library.version in TRIED_VERSIONS else len(TRIED_VERSIONS)
-        return not library.usable, library.version is not None, tried, -(library.version or 0)
+        version = library.version or 0
+        return not library.usable, library.version is not None, version > NEWEST_TRIED, -version
 
     return sorted(dict.fromkeys(libraries), key=rank)
 

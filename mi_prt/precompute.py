@@ -6,11 +6,11 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from .asset import Asset
-from .basis.pca import fit_pca
+from .basis.pca import BLOCK_ROWS, fit_pca
 from .directions import parse_directions
 from .errors import SettingsError
 from .points.points import sample_points
-from .points.tessellate import TESSELLATED_SHAPES
+from .provenance import describe_scene
 from .runtime import count_kernels, peak_memory_bytes, versions
 from .scene.scene import open_scene
 from .transport.direct import find_buried, sample_direct
@@ -74,7 +74,7 @@ def precompute(scene, parameters=None, progress=None, **settings):
     Returns
     -------
     Asset
-        Its `report` holds counts and captured variance; `asset.measured` is not stored, see `measure`.
+        Its `report` holds counts and the captured variance.
 
     Raises
     ------
@@ -137,43 +137,6 @@ def measure(scene, parameters=None, progress=None, **settings):
     return asset, cost
 
 
-def left_out(scene):
-    """What of a scene the transport does not model, in words, one entry for each kind.
-
-    Returns
-    -------
-    list of dict
-        what, shapes (names), share (of the light that those materials scatter, where that can be told).
-    """
-    found = {}
-    for surface in scene.surfaces:
-        for what in surface.material.left_out:
-            entry = found.setdefault((surface.material, what), {"what": what, "shapes": [], "share": None})
-            entry["shapes"].append(surface.name)
-            entry["share"] = round(surface.material.left_out_albedo(), 3)
-    entries = list(found.values())
-    for surface in scene.surfaces:
-        if surface.kind not in TESSELLATED_SHAPES:
-            entries.append({"what": f"{surface.kind}: casts shadows but has no points", "shapes": [surface.name], "share": None})
-        if surface.shape.interior_medium() or surface.shape.exterior_medium():
-            entries.append({"what": "participating medium", "shapes": [surface.name], "share": None})
-    for emitter in scene.local_emitters:
-        entries.append({"what": f"{emitter.class_name()}: light of a local emitter", "shapes": [emitter.id()], "share": None})
-    return entries
-
-
-def describe_scene(scene):
-    """What an asset records of its scene, as plain data."""
-    source = scene.source
-    return {
-        "kind": source.kind,
-        "path": source.path,
-        "parameters": source.parameters,
-        "hash": scene.hash,
-        "left_out": left_out(scene),
-    }
-
-
 def _check_coefficients(wanted, points, directions):
     largest = min(points - 1, directions)
     if wanted is not None and wanted > largest:
@@ -185,24 +148,20 @@ def _check_coefficients(wanted, points, directions):
 
 def _compress(transport, directions, buried, settings, progress):
     """Fit the basis to the points that are not buried (they would only pull it), then encode all points."""
-    n, s = transport.shape
+    n = len(transport.bits)
     kept = np.flatnonzero(~buried) if not buried.all() else np.arange(n)
     wanted = DEFAULT_COEFFICIENTS if settings.coefficients is None else settings.coefficients
-
-    def blocks():
-        for chunk in np.array_split(kept, range(2048, len(kept), 2048)):
-            yield transport.rows(chunk)
-
-    basis = fit_pca(blocks, (len(kept), s), directions.solid_angles, wanted, settings.seed)
+    basis = fit_pca(transport.rows, kept, directions.solid_angles, wanted, settings.seed)
     if settings.coefficients is not None and len(basis.vectors) < settings.coefficients:
         raise SettingsError(
             f"{settings.coefficients} coefficients are above the rank of the transport: at most {len(basis.vectors)}"
         )
-    coefficients = []
-    for block in transport.blocks():
-        coefficients.append(basis.encode(block))
-        progress("basis", sum(map(len, coefficients)), n)
-    return basis, np.concatenate(coefficients).astype(np.float32)
+    coefficients = np.empty((n, len(basis.vectors)), np.float32)
+    for first in range(0, n, BLOCK_ROWS):
+        block = slice(first, min(first + BLOCK_ROWS, n))
+        coefficients[block] = basis.encode(transport.rows(block))
+        progress("basis", block.stop, n)
+    return basis, coefficients
 
 
 class _Clock:

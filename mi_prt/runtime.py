@@ -5,6 +5,7 @@ once and a machine without a usable LLVM gets a typed error instead of an ended 
 """
 
 import ctypes
+import importlib
 import importlib.metadata
 import os
 import platform
@@ -27,13 +28,15 @@ THREADS_PER_CORE = 8
 PACKAGES = ("mi_prt", "mitsuba", "drjit", "numpy", "scipy", "h5py")
 """Distributions whose versions are stored with every result."""
 
-RASTER_LIBRARIES = {"osmesa": "OSMesa", "egl": "EGL"}
-"""Libraries that draw without a screen, by their name in `PYOPENGL_PLATFORM`, the preferred one first."""
+RASTER_PLATFORMS = ("osmesa", "egl")
+"""Values of `PYOPENGL_PLATFORM` that draw without a screen, the preferred one first."""
+
+_LIBATOMIC = {"apt-get": "libatomic1", "dnf": "libatomic", "zypper": "libatomic1", "pacman": "gcc-libs"}
 
 _RASTER_PACKAGES = {
     "apt-get": "libosmesa6",
-    "dnf": "mesa-libEGL mesa-dri-drivers",
-    "zypper": "Mesa-libEGL1 Mesa-dri",
+    "dnf": "mesa-libEGL mesa-dri-drivers libglvnd-opengl",
+    "zypper": "Mesa-libEGL1 Mesa-dri libglvnd",
     "pacman": "mesa libglvnd",
 }
 
@@ -47,11 +50,10 @@ def mitsuba() -> ModuleType:
     Raises
     ------
     RuntimeSetupError
-        If another variant is set, or if the LLVM variant is the one to use and there is no usable LLVM.
+        If Mitsuba cannot be imported, if another variant is set, or if the LLVM variant is the one to use and there
+        is no usable LLVM.
     """
-    select_llvm()
-    import mitsuba as mi
-
+    mi = _load("mitsuba")
     variant = mi.variant()
     if variant is None:
         variant = "cuda_ad_rgb" if cuda_usable() else "llvm_ad_rgb"
@@ -66,11 +68,8 @@ def mitsuba() -> ModuleType:
 
 
 def cuda_usable() -> bool:
-    """Whether Dr.Jit finds a GPU and, for tracing rays, OptiX: containers often pass on the first without the second."""
-    select_llvm()
-    import drjit as dr
-    import mitsuba as mi
-
+    """Whether Dr.Jit finds a GPU and, to trace rays on it, OptiX: containers often pass on one without the other."""
+    dr, mi = _load("drjit"), _load("mitsuba")
     return "cuda_ad_rgb" in mi.variants() and bool(dr.has_backend(dr.JitBackend.CUDA)) and _optix_loadable()
 
 
@@ -79,8 +78,7 @@ def quiet_mitsuba() -> None:
 
     Mitsuba logs to stdout, which belongs to the results of a program. Messages may come from its worker threads.
     """
-    select_llvm()
-    import mitsuba as mi
+    mi = _load("mitsuba")
 
     class StderrAppender(mi.Appender):
         def append(self, level, text):
@@ -111,18 +109,12 @@ def set_threads(count: int) -> None:
     most = THREADS_PER_CORE * (os.cpu_count() or 1)
     if isinstance(count, bool) or not isinstance(count, int) or not 1 <= count <= most:
         raise SettingsError(f"threads must be an integer from 1 to {most} ({THREADS_PER_CORE} per core), got {count!r}")
-    select_llvm()
-    import drjit as dr
-
-    dr.set_thread_count(count)
+    _load("drjit").set_thread_count(count)
 
 
 def thread_count() -> int:
     """How many CPU threads Mitsuba and Dr.Jit use, the calling thread included."""
-    select_llvm()
-    import drjit as dr
-
-    return dr.thread_count()
+    return _load("drjit").thread_count()
 
 
 class KernelCount:
@@ -194,8 +186,16 @@ def peak_memory_bytes() -> int:
 
 def versions() -> dict[str, str]:
     """Versions of `PACKAGES`, Python, and the LLVM that Dr.Jit runs with ("none" where something is absent)."""
-    found = {package: _package_version(package) for package in PACKAGES}
+    found = {package: package_version(package) for package in PACKAGES}
     return found | {"python": platform.python_version(), "llvm": _llvm_version()}
+
+
+def package_version(package: str) -> str:
+    """Version of an installed distribution, "none" if it is not installed."""
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return "none"
 
 
 def raster_platform() -> str:
@@ -215,7 +215,7 @@ def raster_platform() -> str:
         If neither library is installed, if the variable names another platform or one that is not installed, or if
         PyOpenGL was imported before with another platform.
     """
-    installed = [name for name, library in RASTER_LIBRARIES.items() if _installed(library)]
+    installed = [name for name in RASTER_PLATFORMS if _installed(name)]
     chosen = os.environ.get("PYOPENGL_PLATFORM") or next(iter(installed), None)
     if chosen is None:
         raise RuntimeSetupError("neither OSMesa nor EGL is installed, one of which draws without a screen; install it "
@@ -233,15 +233,48 @@ def raster_platform() -> str:
     return chosen
 
 
+def pyrender() -> ModuleType:
+    """The `pyrender` module, ready to draw without a screen on `raster_platform`.
+
+    Its window class is left out: importing it needs X11 libraries, which servers lack and drawing off screen does not
+    use.
+
+    Raises
+    ------
+    RuntimeSetupError
+        As `raster_platform` does.
+    """
+    raster_platform()
+    if "pyrender" not in sys.modules:
+        viewer = ModuleType("pyrender.viewer")
+        viewer.Viewer = None
+        sys.modules["pyrender.viewer"] = viewer
+    return importlib.import_module("pyrender")
+
+
 def raster_install_command() -> str:
     """What to type to install a library that draws without a screen."""
     return install_command(_RASTER_PACKAGES)
 
 
+def _load(module: str) -> ModuleType:
+    """Import drjit or mitsuba after the choice of an LLVM; whatever prevents that becomes a typed error."""
+    select_llvm()
+    try:
+        return importlib.import_module(module)
+    except (ImportError, NameError) as error:  # NameError: Dr.Jit's own handling of an ImportError fails
+        cause = error.__context__ or error
+        reinstall = f"{sys.executable} -m pip install --force-reinstall mitsuba drjit"
+        remedy = install_command(_LIBATOMIC) if "libatomic" in str(cause) else reinstall
+        raise RuntimeSetupError(f"{module} cannot be imported ({cause}); type `{remedy}`") from error
+
+
 @cache
-def _installed(library: str) -> bool:
-    """Whether the dynamic linker knows a library; asked once, because it takes a process."""
-    return find_library(library) is not None
+def _installed(platform: str) -> bool:
+    """Whether a raster platform's libraries are there; asked once, because each takes a process to find."""
+    if platform == "osmesa":
+        return find_library("OSMesa") is not None
+    return find_library("EGL") is not None and any(map(find_library, ("OpenGL", "GL")))
 
 
 def _optix_loadable() -> bool:
@@ -257,22 +290,9 @@ def _optix_loadable() -> bool:
 
 def _launch_totals() -> tuple[int, int, int]:
     """Kernels launched, loaded from disk, and compiled since Dr.Jit was imported."""
-    select_llvm()
-    import drjit as dr
-
-    return dr.detail.launch_stats()
-
-
-def _package_version(package: str) -> str:
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return "none"
+    return _load("drjit").detail.launch_stats()
 
 
 def _llvm_version() -> str:
-    select_llvm()
-    import drjit as dr
-
-    version = dr.detail.llvm_version()
+    version = _load("drjit").detail.llvm_version()
     return ".".join(map(str, version)) if version[0] > 0 else "none"

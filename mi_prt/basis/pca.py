@@ -5,12 +5,15 @@ over the sphere whatever the lattice (erratum 2 of the project's reading of the 
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import scipy.linalg
 
+BLOCK_ROWS = 128  # rows worked on at a time: a block of a few MB stays in the processor's cache
 OVERSAMPLING = 16
-ITERATIONS = 4
+SAMPLE_ITERATIONS = 2  # power iterations on a quarter of the rows, which find nearly the subspace of all
+ITERATIONS = 1  # power iterations on all rows, before the final projection
 EXACT_SIDE = 768  # up to here the Gram matrix of the smaller side is decomposed outright, in float64
 
 
@@ -38,7 +41,15 @@ class PCA:
 
     def encode(self, rows):
         """Coefficients (b, d) float32 of transport rows (b, s)."""
-        return ((rows - self.mean) * self.sqrt_weights) @ self.vectors.T
+        weighted, mean_coefficients = self._encoder
+        coefficients = rows @ weighted
+        coefficients -= mean_coefficients
+        return coefficients
+
+    @cached_property
+    def _encoder(self):
+        """√w·vectorsᵀ (s, d) and the mean's coefficients (d,): weights and mean then cost nothing per row."""
+        return (self.vectors * self.sqrt_weights).T.copy(), self.vectors @ (self.mean * self.sqrt_weights)
 
     def reconstruct(self, coefficients):
         """Transport rows (b, s) float32 of coefficients (b, d)."""
@@ -67,22 +78,22 @@ class PCA:
 
         It drops the part of the mean transport outside the span of the basis (erratum 1).
         """
-        compensated = coefficients + (self.mean * self.sqrt_weights) @ self.vectors.T
+        compensated = coefficients + self._encoder[1]
         return compensated @ (self.vectors @ (radiance * self.sqrt_weights[:, None]))
 
 
-def fit_pca(blocks, shape, weights, components, seed=0):
+def fit_pca(rows, index, weights, components, seed=0):
     """Fit the basis to a matrix that is only ever seen in blocks of rows.
 
-    The leading subspace comes from block subspace iteration on the covariance (a randomized range finder with 4 power
-    iterations: the captured variance falls short of the optimum by less than 1e-3 of it for the spectra of transport);
-    small problems are solved by an exact eigendecomposition.
+    The leading subspace comes from block subspace iteration on the covariance (a randomized range finder with power
+    iterations, the first of them on a sample of the rows); small problems are solved by an exact eigendecomposition.
 
     Parameters
     ----------
-    blocks : callable returning an iterable of (b, s) float32
-        All rows in the same order at each call.
-    shape : (n, s)
+    rows : callable(index) returning (b, s) float32
+        Rows of the matrix.
+    index : (n,) int array
+        The rows to fit to.
     weights : (s,) float
         Solid angles in sr.
     components : int
@@ -94,83 +105,86 @@ def fit_pca(blocks, shape, weights, components, seed=0):
     -------
     PCA
     """
-    n, s = shape
+    weights = np.asarray(weights, dtype=np.float64)
     sqrt_weights = np.sqrt(weights).astype(np.float32)
-    mean, variance = _moments(blocks, n, s, sqrt_weights)
+    n, s = len(index), len(weights)
+    mean, squares = _moments(rows, index, sqrt_weights)
+    variance = max(squares - n * float(mean @ mean), 0.0)
     largest = min(n - 1, s)
     subspace = components + max(OVERSAMPLING, components // 4)
     if subspace > largest / 3 or min(n, s) <= EXACT_SIDE:
-        values, vectors = _exact(blocks, n, s, mean, sqrt_weights, components)
+        values, vectors = _exact(rows, index, mean, sqrt_weights, components)
     else:
-        values, vectors = _subspace_iteration(blocks, s, mean, sqrt_weights, components, subspace, seed)
-    # Directions whose singular value is rounding noise against the largest carry nothing (NumPy's rank tolerance).
+        values, vectors = _subspace_iteration(rows, index, mean, sqrt_weights, components, subspace, seed)
+    # Directions whose singular value is rounding noise carry nothing (NumPy's rank tolerance, on squares).
     tolerance = (max(n, s) * np.finfo(np.float32).eps) ** 2
-    rank = int((values > tolerance * max(values.max(initial=0.0), _rounding_floor(mean, n))).sum())
-    vectors = _fixed_signs(vectors[:, :rank])
+    rank = int((values > tolerance * max(values.max(initial=0.0), squares)).sum())
     captured = values[:rank] / variance if variance > 0 else values[:rank]
     return PCA(
-        np.ascontiguousarray(vectors.T, dtype=np.float32),
+        np.ascontiguousarray(_fixed_signs(vectors[:, :rank]).T, dtype=np.float32),
         (mean / sqrt_weights).astype(np.float32),
         sqrt_weights,
-        captured.astype(np.float64),
+        captured,
     )
 
 
-def _moments(blocks, n, s, sqrt_weights):
-    """Weighted mean (s,) float64 and total variance Σ‖row − mean‖² of the rows."""
-    total = np.zeros(s)
+def _blocks(rows, index):
+    for first in range(0, len(index), BLOCK_ROWS):
+        yield rows(index[first : first + BLOCK_ROWS])
+
+
+def _moments(rows, index, sqrt_weights):
+    """Weighted mean (s,) float64 of the rows and the sum of their squares."""
+    total = np.zeros(len(sqrt_weights))
     squares = 0.0
-    for block in blocks():
-        total += block.sum(axis=0, dtype=np.float64)
-        block = block * sqrt_weights
-        squares += float(np.einsum("bs,bs->", block, block, dtype=np.float64))
-    mean = total / n * sqrt_weights
-    return mean, max(squares - n * float(mean @ mean), 0.0)
+    for block in _blocks(rows, index):
+        total += block.sum(axis=0)
+        block *= sqrt_weights
+        squares += float(np.vdot(block, block))
+    return total / len(index) * sqrt_weights, squares
 
 
-def _rounding_floor(mean, n):
-    """Scale of the squared singular values that rows equal to the mean have from rounding alone."""
-    return n * float(mean @ mean)
-
-
-def _centred(blocks, mean, sqrt_weights, dtype=np.float32):
-    centre = mean.astype(dtype)
-    for block in blocks():
-        yield block.astype(dtype, copy=False) * sqrt_weights.astype(dtype) - centre
-
-
-def _subspace_iteration(blocks, s, mean, sqrt_weights, components, subspace, seed):
-    basis = np.random.default_rng(seed).standard_normal((s, subspace)).astype(np.float32)
-    for _ in range(ITERATIONS):
-        basis = np.linalg.qr(_covariance_times(blocks, mean, sqrt_weights, basis))[0].astype(np.float32)
-    ritz = basis.T.astype(np.float64) @ _covariance_times(blocks, mean, sqrt_weights, basis)
+def _subspace_iteration(rows, index, mean, sqrt_weights, components, subspace, seed):
+    basis = np.random.default_rng(seed).standard_normal((len(sqrt_weights), subspace)).astype(np.float32)
+    sample = index[:: 4 if len(index) > 40 * subspace else 1]
+    for part in [sample] * SAMPLE_ITERATIONS + [index] * ITERATIONS:
+        basis = np.linalg.qr(_covariance_times(rows, part, mean, sqrt_weights, basis))[0].astype(np.float32)
+    ritz = basis.T.astype(np.float64) @ _covariance_times(rows, index, mean, sqrt_weights, basis)
     values, rotation = scipy.linalg.eigh((ritz + ritz.T) / 2)
     leading = slice(None, -components - 1, -1)
     return np.maximum(values[leading], 0), basis @ rotation[:, leading]
 
 
-def _covariance_times(blocks, mean, sqrt_weights, basis):
+def _covariance_times(rows, index, mean, sqrt_weights, basis):
+    """XᵀX·basis for the centred, weighted rows X; weights and mean are applied to the narrow side only."""
+    weighted = basis * sqrt_weights[:, None]
+    centre = (mean @ basis).astype(np.float32)
     product = np.zeros(basis.shape)
-    for block in _centred(blocks, mean, sqrt_weights):
-        product += block.T @ (block @ basis)
-    return product
+    total = np.zeros(basis.shape[1])
+    for block in _blocks(rows, index):
+        narrow = block @ weighted - centre
+        product += block.T @ narrow
+        total += narrow.sum(axis=0, dtype=np.float64)
+    return product * sqrt_weights[:, None] - np.outer(mean, total)
 
 
-def _exact(blocks, n, s, mean, sqrt_weights, components):
+def _exact(rows, index, mean, sqrt_weights, components):
     """Leading eigenpairs of the s × s or n × n Gram matrix, whichever is smaller, in float64."""
-    largest = min(n, s)
-    keep = [largest - min(components, largest), largest - 1]
+    n, s = len(index), len(mean)
+    keep = [min(n, s) - min(components, min(n, s)), min(n, s) - 1]
+    centred = (block.astype(np.float64) * sqrt_weights - mean for block in _blocks(rows, index))
+    if keep[0] > keep[1]:
+        return np.zeros(0), np.zeros((s, 0))
     if s <= n:
         gram = np.zeros((s, s))
-        for block in _centred(blocks, mean, sqrt_weights, np.float64):
+        for block in centred:
             gram += block.T @ block
         values, vectors = scipy.linalg.eigh(gram, subset_by_index=keep)
         return np.maximum(values[::-1], 0), vectors[:, ::-1]
-    rows = np.concatenate(list(_centred(blocks, mean, sqrt_weights, np.float64)))
-    values, left = scipy.linalg.eigh(rows @ rows.T, subset_by_index=keep)
+    matrix = np.concatenate(list(centred))
+    values, left = scipy.linalg.eigh(matrix @ matrix.T, subset_by_index=keep)
     values, left = np.maximum(values[::-1], 0), left[:, ::-1]
-    vectors = rows.T @ left
-    return values, vectors / np.maximum(np.sqrt(values), 1e-300)
+    return values, matrix.T @ left / np.maximum(np.sqrt(values), 1e-300)
 
 
 def _fixed_signs(vectors):

@@ -113,13 +113,14 @@ class Scene:
                 models[bsdf] = model_material(bsdf)
             return models[bsdf]
 
-        for shape in self.mi_scene.shapes():
+        for i, shape in enumerate(self.mi_scene.shapes()):
             if shape.class_name() != "Instance":
-                yield Surface(shape.id(), shape, None, np.eye(4), material(shape))
+                yield Surface(_name(shape, i), shape, None, np.eye(4), material(shape))
                 continue
-            for _, member in children(groups[_group_of(shape)]):
-                if isinstance(member, mitsuba().Shape):
-                    yield Surface(f"{shape.id()}/{member.id()}", member, shape, transform_of(shape), material(member))
+            members = [c for _, c in children(groups[_group_of(shape)]) if isinstance(c, mitsuba().Shape)]
+            for j, member in enumerate(members):
+                name = f"{_name(shape, i)}/{_name(member, j)}"
+                yield Surface(name, member, shape, transform_of(shape), material(member))
 
     @cached_property
     def scale(self):
@@ -261,6 +262,12 @@ def mesh_arrays(mesh):
     if mesh.has_vertex_texcoords():
         uv = np.array(mesh.vertex_texcoords_buffer(), dtype=np.float32).reshape(-1, 2)
     return positions, faces, normals, uv
+
+
+def _name(shape, index):
+    """A shape's id; one that Mitsuba made up (it holds an address, which changes at each run) is replaced."""
+    made_up = not shape.id() or re.fullmatch(r"(object|_unnamed)_\d+", shape.id())
+    return f"{shape.class_name()}-{index}" if made_up else shape.id()
 
 
 def _group_of(instance):

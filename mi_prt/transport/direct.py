@@ -63,7 +63,7 @@ class DirectTransport:
             return cosines
         return np.einsum("bsr,sr->bs", cosines.reshape(-1, s, r), self.fractions)
 
-    def blocks(self, size=2048):
+    def blocks(self, size=128):
         """All rows in order, `size` at a time."""
         for first in range(0, len(self.normals), size):
             yield self.rows(slice(first, first + size))

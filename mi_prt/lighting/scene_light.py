@@ -1,12 +1,12 @@
-"""The distant light of a Mitsuba scene, from its emitters."""
+"""Between Mitsuba's emitters and this program's light: the distant light of a scene, and a scene under other light."""
 
 import numpy as np
 
 from ..errors import LightError
 from ..runtime import mitsuba
-from ..scene.traversal import transform_of
+from ..scene.traversal import children, transform_of
 from .environment import EnvironmentMap
-from .light import DirectionalLight, DistantLight
+from .light import DirectionalLight, DistantLight, as_light
 
 BAKED_HEIGHT = 512  # rows of the map that an analytic sky is baked to
 SUN_SPLITS = 256  # samples across a pixel in which a sun was found
@@ -49,6 +49,75 @@ def emitters_light(emitters):
         else:
             maps.append(_baked(emitter))
     return DistantLight(tuple(maps), tuple(directionals))
+
+
+def lit_scene(mi_scene, light=None):
+    """The same shapes and sensors as a new mi.Scene under other distant light, with watertight intersections.
+
+    Parameters
+    ----------
+    mi_scene : mi.Scene
+    light : DistantLight or what `as_light` accepts, optional
+        Takes the place of the scene's distant emitters; by default they stay.
+
+    Returns
+    -------
+    mi.Scene
+
+    Raises
+    ------
+    LightError
+        If the light has more than one environment map: Mitsuba takes one.
+    """
+    mi = mitsuba()
+    kept = {}
+    for i, (_, child) in enumerate(children(mi_scene)):
+        is_light = isinstance(child, mi.Emitter)
+        replaced = is_light and light is not None and mi.has_flag(child.flags(), mi.EmitterFlags.Infinite)
+        if isinstance(child, mi.Shape | mi.Sensor) or (is_light and not replaced):
+            kept[f"part{i}"] = child
+    if light is not None:
+        kept |= _emitters(as_light(light))
+    return mi.load_dict({"type": "scene", "embree_use_robust_intersections": True, **kept}, optimize=False, parallel=False)
+
+
+def turned_light(scene, light=None, rotate=None):
+    """The light to show a scene in.
+
+    Returns
+    -------
+    shown : DistantLight or None
+        What replaces the scene's distant emitters; None where they stay.
+    cells_light : DistantLight
+        What is projected on the asset's lattice.
+    """
+    chosen = scene_light(scene) if light is None else as_light(light)
+    if rotate is not None:
+        chosen = chosen.rotated(*rotate)
+    return (None if light is None and rotate is None else chosen), chosen
+
+
+def _emitters(light):
+    """Mitsuba emitter dicts of a DistantLight."""
+    mi = mitsuba()
+    if len(light.maps) > 1:
+        raise LightError(f"the light has {len(light.maps)} environment maps, Mitsuba takes one: add their pixels first")
+    emitters = {}
+    for environment in light.maps:
+        to_world = np.eye(4)
+        to_world[:3, :3] = environment.rotation
+        emitters["environment"] = {
+            "type": "envmap",
+            "bitmap": mi.Bitmap(environment.pixels),
+            "to_world": mi.ScalarTransform4f(to_world),
+        }
+    for i, source in enumerate(light.directionals):
+        emitters[f"directional{i}"] = {
+            "type": "directional",
+            "direction": [float(x) for x in source.direction],
+            "irradiance": {"type": "rgb", "value": [float(x) for x in source.irradiance]},
+        }
+    return emitters
 
 
 def _directional(emitter):

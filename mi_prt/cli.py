@@ -1,0 +1,341 @@
+"""The command line: mi-prt doctor | info | precompute | relight | compare."""
+
+import json
+import sys
+import time
+import warnings
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Optional
+
+import typer
+
+from .errors import InputError, PrtError, SettingsError
+
+app = typer.Typer(
+    name="mi-prt",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+    context_settings={"help_option_names": ["-h", "--help"]},
+    help="Precomputed radiance transfer for Mitsuba 3: precompute how light moves through a scene, then relight it in "
+    "milliseconds.\n\nExample: mi-prt precompute scenes/teapot.xml -o teapot.prt && "
+    "mi-prt relight teapot.prt -o teapot.png --rotate y:45",
+)
+
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else.")]
+Threads = Annotated[Optional[int], typer.Option("--threads", metavar="N", help="CPU threads; default: all cores.")]
+Define = Annotated[
+    Optional[list[str]], typer.Option("-D", metavar="NAME=VALUE", help="Value for a <default> parameter of the XML.")
+]
+Environment = Annotated[
+    Optional[Path], typer.Option("--envmap", metavar="EXR", help="Environment map; default: the scene's own light.")
+]
+Rotate = Annotated[
+    Optional[str], typer.Option("--rotate", metavar="AXIS:DEGREES", help="Turn the light about x, y, z or a,b,c.")
+]
+OtherScene = Annotated[
+    Optional[Path], typer.Option("--scene", metavar="SCENE", help="The asset's scene, if it is elsewhere by now.")
+]
+Sensor = Annotated[int, typer.Option("--sensor", help="Index of the scene's sensor.")]
+Size = Annotated[Optional[str], typer.Option("--size", metavar="WxH", help="Image size; default: the sensor's.")]
+Directions = Annotated[str, typer.Option("--directions", metavar="cubemap:N", help="Lattice of 6·N·N directions.")]
+Coefficients = Annotated[
+    Optional[int],
+    typer.Option("--coefficients", metavar="D", help="Components of the basis; default: 48, or the rank if lower."),
+]
+EdgeLength = Annotated[
+    str, typer.Option("--edge-length", metavar="auto|METRES", help="Coarse faces are tessellated down to this.")
+]
+Rays = Annotated[int, typer.Option("--rays-per-direction", metavar="R", help="Rays in each cell; 4 antialias shadows.")]
+Seed = Annotated[int, typer.Option("--seed", help="Same seed, same result.")]
+
+
+@app.command(epilog="Example: mi-prt doctor --json")
+def doctor(as_json: Json = False):
+    """Check this machine: LLVM, Mitsuba, Embree, raster platform; with the remedy for each fault."""
+    from . import doctor as examination
+
+    checks = examination.examine()
+    if as_json:
+        _print_json(examination.as_dict(checks))
+    else:
+        colours = {"ok": "green", "warning": "yellow", "fault": "red"}
+        _table([(f"[{colours[c.status]}]{c.status}[/]", c.name, c.value, c.remedy or "") for c in checks])
+    if any(check.status == "fault" for check in checks):
+        raise typer.Exit(1)
+
+
+@app.command(epilog="Example: mi-prt info scenes/still_life.xml --directions cubemap:16 --json")
+def info(
+    path: Annotated[Path, typer.Argument(help="A scene (XML) or an asset.")],
+    directions: Directions = "cubemap:32",
+    coefficients: Coefficients = None,
+    edge_length: EdgeLength = "auto",
+    rays_per_direction: Rays = 1,
+    define: Define = None,
+    as_json: Json = False,
+):
+    """Say what a scene requires and what precomputing it will cost, or what an asset holds."""
+    from . import info as description
+
+    if path.is_file() and _is_hdf5(path):
+        from .asset import load
+
+        found = description.describe_asset(load(path))
+    else:
+        found = description.describe(
+            path,
+            _parameters(define),
+            directions=directions,
+            coefficients=coefficients,
+            edge_length=edge_length,
+            rays_per_direction=rays_per_direction,
+        )
+    _print_json(found) if as_json else _print_nested(found)
+
+
+@app.command(epilog="Example: mi-prt precompute scenes/teapot.xml -o teapot.prt --coefficients 96 -D spp=16")
+def precompute(
+    scene: Annotated[Path, typer.Argument(help="A Mitsuba XML file.")],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="The asset to write.")],
+    directions: Directions = "cubemap:32",
+    coefficients: Coefficients = None,
+    edge_length: EdgeLength = "auto",
+    rays_per_direction: Rays = 1,
+    seed: Seed = 0,
+    threads: Threads = None,
+    define: Define = None,
+    as_json: Json = False,
+):
+    """Precompute a scene's transport into one file."""
+    from .asset import check_writable
+    from .precompute import measure
+
+    check_writable(output)
+    _set_threads(threads)
+    started = time.perf_counter()
+    with _progress(as_json) as progress:
+        asset, cost = measure(
+            scene,
+            _parameters(define),
+            progress,
+            directions=directions,
+            coefficients=coefficients,
+            edge_length=edge_length,
+            rays_per_direction=rays_per_direction,
+            seed=seed,
+        )
+    writing = time.perf_counter()
+    asset.save(output)
+    finished = time.perf_counter()
+    cost["seconds"] |= {"write": round(finished - writing, 4), "total": round(finished - started, 4)}
+    for entry in asset.scene["left_out"]:
+        _note(f"not modelled: {entry['what']}" + (f" ({', '.join(entry['shapes'][:5])})" if entry["shapes"] else ""))
+    result = {
+        "points": len(asset.points),
+        "directions": len(asset.directions),
+        "coefficients": len(asset.basis.vectors),
+        "captured_variance": asset.report["captured_variance"],
+        "bytes": output.stat().st_size,
+        **cost,
+    }
+    _print_json(result) if as_json else _print_nested({"wrote": str(output)} | result)
+
+
+@app.command(epilog="Example: mi-prt relight teapot.prt -o teapot.png --envmap sky.exr --rotate y:90 --size 640x480")
+def relight(
+    asset_path: Annotated[Path, typer.Argument(metavar="FILE", help="An asset.")],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="OUT", help=".exr, .png, .ply or .npz")],
+    envmap: Environment = None,
+    rotate: Rotate = None,
+    sensor: Sensor = 0,
+    size: Size = None,
+    renderer: Annotated[str, typer.Option("--renderer", metavar="mitsuba|raster")] = "mitsuba",
+    spp: Annotated[int, typer.Option("--spp", help="Samples per pixel of mitsuba's image.")] = 64,
+    scene: OtherScene = None,
+    threads: Threads = None,
+    as_json: Json = False,
+):
+    """Relight an asset: an image, a mesh with vertex radiance, or plain arrays."""
+    from .asset import load
+    from .relight import relight_to_file
+
+    _set_threads(threads)
+    result = relight_to_file(
+        load(asset_path), output, envmap, _rotation(rotate), scene, sensor, _size(size), renderer, spp
+    )
+    _print_json(result) if as_json else _print_nested({"wrote": str(output)} | result)
+
+
+@app.command(epilog="Example: mi-prt compare teapot.prt -o teapot-report --spp 512 --json")
+def compare(
+    asset_path: Annotated[Path, typer.Argument(metavar="FILE", help="An asset.")],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the report.")],
+    envmap: Environment = None,
+    rotate: Rotate = None,
+    sensor: Sensor = 0,
+    size: Size = None,
+    spp: Annotated[int, typer.Option("--spp", help="Samples per pixel of the reference.")] = 256,
+    reference: Annotated[str, typer.Option("--reference", metavar="modelled|full")] = "modelled",
+    scene: OtherScene = None,
+    seed: Seed = 0,
+    threads: Threads = None,
+    as_json: Json = False,
+):
+    """Compare an asset with Mitsuba's ground truth and write a report with pictures."""
+    from .asset import load
+    from .evaluate.compare import compare as run
+
+    _set_threads(threads)
+    asset = load(asset_path)
+    with _progress(as_json) as progress:
+        result = run(
+            asset,
+            output,
+            envmap,
+            _rotation(rotate),
+            scene,
+            sensor,
+            _size(size),
+            spp,
+            reference,
+            seed,
+            progress,
+        )
+    _print_json(result) if as_json else _print_nested({"wrote": str(output / "index.html")} | result)
+
+
+def main(arguments=None):
+    """Run the program; exit codes: 0 done, 2 bad usage or input, 1 anything else."""
+    warnings.showwarning = lambda message, *_, **__: _note(str(message))
+    try:
+        from .runtime import quiet_mitsuba
+
+        if not _only_help(sys.argv[1:] if arguments is None else arguments):
+            quiet_mitsuba()
+        app(arguments, standalone_mode=True)
+    except PrtError as error:
+        print(f"mi-prt: {error}", file=sys.stderr)
+        sys.exit(error.exit_code)
+    except KeyboardInterrupt:
+        print("mi-prt: interrupted; nothing was left half-written", file=sys.stderr)
+        sys.exit(1)
+    except MemoryError:
+        print("mi-prt: out of memory: use fewer --directions or a longer --edge-length", file=sys.stderr)
+        sys.exit(1)
+
+
+# --- what the user passes ------------------------------------------------------------------------------------------
+
+
+def _only_help(arguments):
+    return not arguments or any(a in ("-h", "--help") for a in arguments)
+
+
+def _parameters(define):
+    parameters = {}
+    for entry in define or []:
+        name, equals, value = entry.partition("=")
+        if not (name and equals):
+            raise SettingsError(f"-D {entry} is not of the form NAME=VALUE")
+        parameters[name] = value
+    return parameters
+
+
+def _rotation(text):
+    if text is None:
+        return None
+    axis, colon, degrees = text.rpartition(":")
+    try:
+        named = axis in ("x", "y", "z")
+        vector = axis if named else tuple(float(x) for x in axis.split(","))
+        if not colon or not (named or len(vector) == 3):
+            raise ValueError
+        return vector, float(degrees)
+    except ValueError:
+        raise SettingsError(f"--rotate {text} is not of the form AXIS:DEGREES, for example y:30 or 0,1,1:30") from None
+
+
+def _size(text):
+    if text is None:
+        return None
+    width, times, height = text.lower().partition("x")
+    if not (times and width.isdigit() and height.isdigit()):
+        raise SettingsError(f"--size {text} is not of the form WxH, for example 640x480")
+    return int(width), int(height)
+
+
+def _set_threads(threads):
+    if threads is not None:
+        from .runtime import set_threads
+
+        set_threads(threads)
+
+
+def _is_hdf5(path):
+    with open(path, "rb") as file:
+        return file.read(8) == b"\x89HDF\r\n\x1a\n"
+
+
+# --- what the user sees --------------------------------------------------------------------------------------------
+
+
+def _print_json(value):
+    print(json.dumps(value, allow_nan=True))
+
+
+def _note(text):
+    print(f"mi-prt: {text}", file=sys.stderr)
+
+
+def _table(rows):
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(box=None, show_header=False, pad_edge=False)
+    for row in rows:
+        table.add_row(*row)
+    Console().print(table)
+
+
+def _print_nested(value, indent=""):
+    for key, entry in value.items():
+        if isinstance(entry, dict) and entry:
+            print(f"{indent}{key}:")
+            _print_nested(entry, indent + "  ")
+        elif isinstance(entry, list) and entry and isinstance(entry[0], dict):
+            print(f"{indent}{key}:")
+            for item in entry:
+                print(f"{indent}  - " + ", ".join(f"{k} {_plain(v)}" for k, v in item.items() if v not in (None, [])))
+        else:
+            print(f"{indent}{key}: {_plain(entry)}")
+
+
+def _plain(entry):
+    if isinstance(entry, float):
+        return f"{entry:.6g}"
+    if isinstance(entry, list):
+        return ", ".join(_plain(x) for x in entry) or "none"
+    if isinstance(entry, int) and not isinstance(entry, bool):
+        return f"{entry:,}"
+    return str(entry)
+
+
+@contextmanager
+def _progress(quiet=False):
+    """A callable(stage, done, total) that draws progress with ETA on stderr."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(elapsed_when_finished=True)
+    tasks = {}
+    with Progress(*columns, console=Console(stderr=True)) as bar:
+
+        def progress(stage, done, total):
+            if stage not in tasks:
+                tasks[stage] = bar.add_task(stage, total=total)
+            bar.update(tasks[stage], completed=done)
+
+        yield progress

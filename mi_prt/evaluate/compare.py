@@ -1,0 +1,149 @@
+"""An asset against Mitsuba's ground truth, at the points and in the image, with the error explained."""
+
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import SettingsError
+from ..lighting.scene_light import lit_scene, turned_light
+from ..provenance import open_scene_of
+from ..render.display import display, exposure
+from ..render.image import coverage, pick_sensor, render_image, resized
+from . import ground_truth, metrics
+from .report import write_report
+
+REFERENCES = ("modelled", "full")
+COMPARED_POINTS = 4096
+POINT_SAMPLES = 4096  # samples of the emitters at each compared point
+IMAGE_SAMPLES = 64  # samples per pixel of the asset's own image: it has no noise but that of antialiasing
+
+
+def compare(
+    asset,
+    folder,
+    light=None,
+    rotate=None,
+    scene=None,
+    sensor=0,
+    size=None,
+    spp=256,
+    reference="modelled",
+    seed=0,
+    progress=lambda stage, done, total: None,
+):
+    """Compare an asset with Mitsuba and write the comparison to a folder.
+
+    Parameters
+    ----------
+    asset : Asset
+    folder : path
+        Gets report.json, index.html, EXRs and PNGs; created if need be.
+    light : what `as_light` accepts, optional
+        By default the scene's own distant light.
+    rotate : (axis, degrees), optional
+        Turns the light.
+    scene : path, dict or mi.Scene, optional
+        If the asset's scene is somewhere else by now.
+    sensor : int
+    size : (width, height), optional
+        By default the sensor's.
+    spp : int
+        Samples per pixel of the reference image.
+    reference : 'modelled' or 'full'
+        Truth as modelled (other materials replaced by their diffuse albedo, local emitters dark) or as written.
+    seed : int
+    progress : callable(stage, done, total)
+
+    Returns
+    -------
+    dict
+        points{count, relative_rmse, bias, reference_noise, …}, image{relative_rmse, bias, psnr, flip,
+        reference_noise, …}, seconds{relight, reference}, and what was compared.
+    """
+    if reference not in REFERENCES:
+        raise SettingsError(f"reference '{reference}' is not known: use {' or '.join(REFERENCES)}")
+    if spp < 2:
+        raise SettingsError(f"spp {spp} is too low: the reference's noise is told from two halves, so at least 2")
+    folder = _made_folder(folder)
+    opened = open_scene_of(asset, scene)
+    shown, cells_light = turned_light(opened, light, rotate)
+    truth = lit_scene(opened.modelled() if reference == "modelled" else opened.mi_scene, shown)
+    seconds = {}
+
+    progress("relight", 0, 3)
+    started = time.perf_counter()
+    irradiance = asset.irradiance(cells_light)
+    seconds["relight"] = time.perf_counter() - started
+
+    progress("reference at the points", 1, 3)
+    started = time.perf_counter()
+    chosen = np.sort(np.random.default_rng(seed).permutation(len(asset.points))[:COMPARED_POINTS])
+    at_points = ground_truth.point_irradiance(truth, _subset(asset.points, chosen), POINT_SAMPLES, seed)
+
+    progress("reference image", 2, 3)
+    with resized(pick_sensor(truth, sensor), size) as camera:
+        expected = ground_truth.image(truth, camera, spp, seed)
+        seconds["reference"] = time.perf_counter() - started
+        result = render_image(asset, truth, camera, IMAGE_SAMPLES, seed)
+        covered = coverage(truth, camera, IMAGE_SAMPLES, seed) > 1 - 1e-4
+    progress("report", 3, 3)
+
+    report = {
+        "asset": str(asset.path) if asset.path else None,
+        "scene": opened.source.path,
+        "reference": reference,
+        "left_out": asset.scene["left_out"],
+        "coefficients": len(asset.basis.vectors),
+        "directions": len(asset.directions),
+        "captured_variance": asset.report["captured_variance"],
+        "points": {"count": len(chosen)} | _errors(irradiance[chosen], at_points),
+        "image": _image_errors(result, expected, covered),
+        "seconds": {name: round(value, 4) for name, value in seconds.items()},
+    }
+    write_report(folder, report, result, expected.mean, covered)
+    return report
+
+
+def _made_folder(folder):
+    folder = Path(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / ".writable").touch()
+        (folder / ".writable").unlink()
+    except OSError as error:
+        raise SettingsError(f"output folder '{folder}' cannot be written: {error.strerror}") from None
+    return folder
+
+
+def _subset(points, index):
+    return replace(points, **{name: getattr(points, name)[index] for name in ("positions", "normals", "geometric_normals")})
+
+
+def _errors(result, reference):
+    rmse = metrics.relative_rmse(result, reference.mean)
+    noise = reference.noise
+    return {
+        "relative_rmse": rmse,
+        "bias": metrics.relative_bias(result, reference.mean),
+        "reference_noise": noise,
+        "relative_rmse_beyond_noise": float(np.sqrt(max(rmse**2 - noise**2, 0.0))),
+    }
+
+
+def _image_errors(result, expected, covered):
+    """Linear errors and PSNR over pixels that geometry covers wholly; FLIP over the whole image."""
+    if not covered.any():
+        raise SettingsError("the sensor sees no surface: nothing to compare in the image")
+    masked = ground_truth.Reference(expected.mean[covered], expected.standard_error[covered])
+    factor = exposure(masked.mean)
+    shown, truth = display(result, factor), display(expected.mean, factor)
+    mean_flip, _ = metrics.flip(shown, truth)
+    return _errors(result[covered], masked) | {
+        "psnr": metrics.psnr(shown, truth, covered),
+        "flip": mean_flip,
+        "exposure": factor,
+        "covered": float(covered.mean()),
+        "size": [result.shape[1], result.shape[0]],
+    }

@@ -1,0 +1,128 @@
+"""The folder that `compare` leaves: numbers, pictures, and a page to look at."""
+
+import html
+import json
+from pathlib import Path
+
+import numpy as np
+
+from ..render.display import LUMINANCE, display
+from ..render.export import write_image
+from . import metrics
+
+_PAGE = """<!doctype html>
+<html lang="en"><meta charset="utf-8"><title>mi_prt comparison</title>
+<style>
+body {{ font: 16px/1.5 system-ui, sans-serif; max-width: 72rem; margin: 2rem auto; padding: 0 1rem; color: #222 }}
+figure {{ display: inline-block; margin: 0 1rem 1rem 0; vertical-align: top; max-width: 100% }}
+img {{ max-width: 100%; image-rendering: auto }}
+table {{ border-collapse: collapse; margin: 1rem 0 }} td, th {{ padding: .2rem 1rem .2rem 0; text-align: right }}
+th:first-child, td:first-child {{ text-align: left }} tr {{ border-bottom: 1px solid #ddd }}
+</style>
+<h1>{title}</h1>
+<p>{summary}</p>
+<figure><img src="result.png" alt=""><figcaption>mi_prt</figcaption></figure>
+<figure><img src="reference.png" alt=""><figcaption>Mitsuba, {reference}</figcaption></figure>
+<figure><img src="error.png" alt=""><figcaption>Signed luminance error: blue darker, red brighter, full colour at
+&plusmn;{error_range:.0%} of the mean</figcaption></figure>
+<figure><img src="flip.png" alt=""><figcaption>FLIP: dark is equal to the eye, bright is different</figcaption></figure>
+<table><tr><th></th><th>relative RMSE</th><th>beyond noise</th><th>bias</th><th>reference noise</th><th>PSNR</th><th>FLIP</th></tr>
+<tr><td>{count:,} points, irradiance</td>{points}<td></td><td></td></tr>
+<tr><td>image, radiance where geometry covers the pixel</td>{image}<td>{psnr:.1f} dB</td><td>{flip:.4f}</td></tr></table>
+<h2>What makes the error</h2>
+<ul>{causes}</ul>
+</html>
+"""
+ERROR_RANGE = 0.5
+
+
+def write_report(folder, report, result, reference, covered):
+    """Write report.json, index.html, EXRs and PNGs.
+
+    Parameters
+    ----------
+    folder : Path
+    report : dict
+        As `compare` returns it.
+    result, reference : (h, w, 3) float32
+        Linear radiance.
+    covered : (h, w) bool
+        Pixels that geometry covers wholly.
+    """
+    folder = Path(folder)
+    factor = report["image"]["exposure"]
+    shown, truth = display(result, factor), display(reference, factor)
+    error = _error_map(result, reference, covered)
+    flip_map = _coloured(metrics.flip(shown, truth)[1], "magma")
+    write_image(folder / "result.exr", result)
+    write_image(folder / "reference.exr", reference)
+    for name, picture in (("result", shown), ("reference", truth), ("error", error), ("flip", flip_map)):
+        _write_png(folder / f"{name}.png", picture)
+    _write_png(folder / "side_by_side.png", np.concatenate([shown, truth, error], axis=1))
+    (folder / "report.json").write_text(json.dumps(report, indent=2) + "\n")
+    (folder / "index.html").write_text(_page(report))
+
+
+def _error_map(result, reference, covered):
+    mean = (reference[covered] @ LUMINANCE).mean()
+    error = (result - reference) @ LUMINANCE / max(mean, 1e-30)
+    return _coloured(np.where(covered, error, 0) / (2 * ERROR_RANGE) + 0.5, "seismic")
+
+
+def _coloured(values, colours):
+    import matplotlib
+
+    return matplotlib.colormaps[colours](np.clip(values, 0, 1))[..., :3].astype(np.float32)
+
+
+def _write_png(path, shown):
+    from PIL import Image
+
+    Image.fromarray(np.rint(np.clip(shown, 0, 1) * 255).astype(np.uint8)).save(path)
+
+
+def _page(report):
+    points, picture = report["points"], report["image"]
+
+    def cells(errors):
+        keys = ("relative_rmse", "relative_rmse_beyond_noise", "bias", "reference_noise")
+        return "".join(f"<td>{errors[key]:.2%}</td>" for key in keys)
+
+    return _PAGE.format(
+        title=html.escape(Path(report["scene"] or "scene in memory").name),
+        summary=html.escape(
+            f"{report['coefficients']} coefficients over {report['directions']:,} directions hold "
+            f"{report['captured_variance']:.2%} of the transport's variance. Relit in "
+            f"{1e3 * report['seconds']['relight']:.0f} ms (light averaged over the lattice included); "
+            f"the reference took {report['seconds']['reference']:.1f} s."
+        ),
+        reference=report["reference"],
+        error_range=ERROR_RANGE,
+        count=points["count"],
+        points=cells(points),
+        image=cells(picture),
+        psnr=picture["psnr"],
+        flip=picture["flip"],
+        causes="".join(f"<li>{html.escape(cause)}</li>" for cause in _causes(report)),
+    )
+
+
+def _causes(report):
+    """The sources of error that this comparison can hold, in words."""
+    yield (
+        f"Reference noise: {report['points']['reference_noise']:.2%} at the points and "
+        f"{report['image']['reference_noise']:.2%} in the image are Mitsuba's own; more spp lower them."
+    )
+    yield (
+        f"Compression: {1 - report['captured_variance']:.2%} of the transport's variance is not in the basis; "
+        "more coefficients lower it."
+    )
+    yield (
+        f"Directions: light and shadows are averaged over cells of "
+        f"{np.degrees(np.sqrt(4 * np.pi / report['directions'])):.1f}°, which blurs the shadow of a small sun."
+    )
+    yield "Points: irradiance is interpolated between points; shadows narrower than their distance are lost."
+    for entry in report["left_out"]:
+        share = f" ({entry['share']:.0%} of the light those shapes scatter)" if entry["share"] is not None else ""
+        seen = "in the reference, not in the result" if report["reference"] == "full" else "in neither image"
+        yield f"Not modelled: {entry['what']}{share}, {seen}."

@@ -1,0 +1,88 @@
+"""HDR images of an asset by Mitsuba, through the integrator `prt`."""
+
+from contextlib import contextmanager
+
+import numpy as np
+
+from ..errors import SettingsError
+from ..runtime import mitsuba
+from .integrator import integrator_for
+
+MAX_PIXELS = 1 << 26
+
+
+def render_image(asset, mi_scene, sensor, spp=64, seed=0):
+    """Image of a scene lit from an asset by its distant emitters.
+
+    Parameters
+    ----------
+    asset : Asset
+    mi_scene : mi.Scene
+    sensor : mi.Sensor
+    spp : int
+        Samples per pixel; they antialias, there is no other noise.
+    seed : int
+
+    Returns
+    -------
+    (h, w, 3) float32
+        Linear radiance.
+    """
+    rendered = mitsuba().render(mi_scene, sensor=sensor, integrator=integrator_for(asset), spp=spp, seed=seed)
+    return np.array(rendered)[..., :3]
+
+
+def pick_sensor(mi_scene, index):
+    """Sensor of a scene by its index.
+
+    Raises
+    ------
+    SettingsError
+        If there is none of that index.
+    """
+    sensors = mi_scene.sensors()
+    if not sensors:
+        raise SettingsError("the scene has no sensor: add one to it, or ask for .ply or .npz output, which needs none")
+    if not 0 <= index < len(sensors):
+        raise SettingsError(f"sensor {index} does not exist: the scene has sensors 0…{len(sensors) - 1}")
+    return sensors[index]
+
+
+@contextmanager
+def resized(sensor, size):
+    """Within the block the sensor's film has another size (width, height); None leaves it as it is.
+
+    Raises
+    ------
+    SettingsError
+        If a side is below 1 or the image would have more than 67 million pixels.
+    """
+    if size is None:
+        yield sensor
+        return
+    width, height = size
+    if min(width, height) < 1 or width * height > MAX_PIXELS:
+        raise SettingsError(f"image size {width}x{height} must be at least 1x1 and at most {MAX_PIXELS:,} pixels")
+    parameters = mitsuba().traverse(sensor)
+    before = {key: parameters[key] for key in ("film.size", "film.crop_size", "film.crop_offset")}
+    parameters["film.size"] = parameters["film.crop_size"] = [width, height]
+    parameters["film.crop_offset"] = [0, 0]
+    parameters.update()
+    try:
+        yield sensor
+    finally:
+        for key, value in before.items():
+            parameters[key] = value
+        parameters.update()
+
+
+def coverage(mi_scene, sensor, spp, seed=0):
+    """Share of each pixel that geometry covers, (h, w) float32: 1 inside silhouettes, 0 on the background."""
+    mi = mitsuba()
+
+    class Coverage(mi.SamplingIntegrator):
+        def sample(self, scene, sampler, ray, medium=None, active=True):
+            hit = scene.ray_intersect_preliminary(ray, coherent=True, active=active).is_valid()
+            return mi.Color3f(mi.Float(hit)), active, []
+
+    return np.array(mi.render(mi_scene, sensor=sensor, integrator=Coverage(mi.Properties()), spp=spp, seed=seed))[..., 0]

@@ -1,0 +1,159 @@
+"""The Mitsuba integrator `prt`: any sensor and film, lit from an asset in one ray per sample."""
+
+import hashlib
+from functools import cache
+
+import numpy as np
+
+from ..asset import load
+from ..errors import InputError
+from ..lighting.scene_light import scene_light
+from ..points.locate import PatchLocator
+from ..runtime import VARIANTS, mitsuba
+from ..scene.scene import Scene, SceneSource
+
+
+def register_integrator():
+    """Register the plugin `prt` in the variants of `runtime.VARIANTS`, now and whenever one is set."""
+    import mitsuba as mi
+
+    mi.detail.add_variant_callback(lambda old, new: _register(new))
+    if mi.variant() is not None:
+        _register(mi.variant())
+
+
+def _register(variant):
+    if variant in VARIANTS:
+        import mitsuba as mi
+
+        mi.register_integrator("prt", _plugin_class(variant))
+
+
+@cache
+def _plugin_class(variant):
+    """The plugin for a variant, while that is set: its base class is another one in each."""
+    import drjit as dr
+    import mitsuba as mi
+
+    class PRTIntegrator(mi.SamplingIntegrator):
+        """Precomputed radiance transfer (`prt`).
+
+        Shows a scene under its distant emitters with the transport of an asset. The irradiance at the asset's points is
+        interpolated at each hit and multiplied by the albedo there, so textures keep their own resolution; emitters
+        and the background are shown as Mitsuba's own integrators show them.
+
+        Parameters (plugin)
+        -------------------
+        filename : str
+            The asset; relative paths are resolved as Mitsuba resolves them (next to the XML file).
+        hide_emitters : bool, default false
+
+        Raises
+        ------
+        AssetError
+            If the file cannot be read.
+        SceneError
+            When rendering a scene whose geometry is not that of the asset.
+        LightError
+            When rendering a scene without distant emitters.
+        """
+
+        def __init__(self, properties, asset=None):
+            super().__init__(properties)
+            self.asset = asset or _load(str(properties["filename"]))
+            self._keep = mi.Float(np.where(self.asset.buried, 0.0, 1.0).astype(np.float32))
+            self._scene = self._light = self._irradiance = None
+
+        def render(self, scene, sensor=0, *arguments, **named):
+            # Once for each image: emitters may have been edited since the last one, geometry may not.
+            self._prepare(scene)
+            return super().render(scene, sensor, *arguments, **named)
+
+        def _prepare(self, scene):
+            if self._scene is not scene:
+                self._wrapped = Scene(scene, SceneSource("object", content=scene))
+                self._locator = PatchLocator(self._wrapped, self.asset.points)
+                self._scene = scene
+            light = _fingerprint(self._wrapped.distant_emitters)
+            if self._light != light:
+                irradiance = self.asset.irradiance(scene_light(self._wrapped))
+                self._irradiance = mi.Float(irradiance.ravel())
+                self._light = light
+
+        def sample(self, scene, sampler, ray, medium=None, active=True):
+            if self._scene is not scene:
+                self._prepare(scene)
+            if self.hide_emitters:
+                pi = self.skip_area_emitters(scene, ray, True, active)
+            else:
+                pi = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
+            si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
+            hit = active & si.is_valid()
+
+            # --- light that the surface reflects
+            points, weights, found = self._locator.locate(pi, si, hit)
+            # Buried corners of the triangle around a visible hit would darken it: the others take their share.
+            kept = [w * dr.gather(mi.Float, self._keep, p, found) for p, w in zip(points, weights)]
+            sum_kept = sum(kept)
+            usable = sum_kept > 1e-4
+            shares = [dr.select(usable, k / sum_kept, w) for k, w in zip(kept, weights)]
+            irradiance = sum(w * dr.gather(mi.Color3f, self._irradiance, p, found) for p, w in zip(points, shares))
+            albedo = self._albedo(si, found)
+            radiance = dr.select(found, albedo * irradiance / dr.pi, 0)
+
+            # --- light that is seen directly
+            visible = hit | ~mi.Bool(self.hide_emitters)
+            if not self.hide_emitters:
+                emitter = si.emitter(scene, active)
+                radiance += dr.select(active, emitter.eval(si, active), 0)
+            shown = hit if self.hide_emitters or scene.environment() is None else active
+            return radiance, shown & visible, []
+
+        def _albedo(self, si, active):
+            """Diffuse reflectance at hits, from the modelled material of each surface."""
+            replaced = [s for s in self._wrapped.surfaces if s.material.modelled is not s.material.bsdf]
+            bsdf = si.bsdf()
+            for material in {s.material for s in replaced}:
+                bsdf = dr.select(bsdf == mi.BSDFPtr(material.bsdf), mi.BSDFPtr(material.modelled), bsdf)
+            return bsdf.eval_diffuse_reflectance(si, active)
+
+        def to_string(self):
+            return f"PRTIntegrator[filename={self.asset.path}, points={len(self.asset.points)}]"
+
+    return PRTIntegrator
+
+
+def integrator_for(asset):
+    """The integrator for an asset in memory.
+
+    Returns
+    -------
+    mi.Integrator
+    """
+    mi = mitsuba()
+    return _plugin_class(mi.variant())(mi.Properties("prt"), asset)
+
+
+def _load(filename):
+    import mitsuba as mi
+
+    try:
+        return load(str(mi.file_resolver().resolve(filename)))
+    except InputError:
+        return load(filename)
+
+
+def _fingerprint(emitters):
+    """Hash of all parameters of some emitters."""
+    import mitsuba as mi
+
+    digest = hashlib.sha256()
+    for emitter in emitters:
+        digest.update(emitter.class_name().encode())
+        parameters = mi.traverse(emitter)
+        for key in sorted(parameters.keys()):
+            value = parameters[key]
+            digest.update(key.encode())
+            value = value.matrix if hasattr(value, "matrix") else value
+            digest.update(np.ascontiguousarray(np.array(value)).tobytes())
+    return digest.hexdigest()
