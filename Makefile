@@ -1,8 +1,8 @@
 # Each target sets up everything that it needs (setup.sh), so that it works on a fresh machine.
 # The stamp holds the folder that was set up: a moved or copied folder is set up again, because .venv does not move.
-VENV   := .venv
-PYTHON := $(VENV)/bin/python
-STAMP  := $(VENV)/.ready
+venv   := .venv
+python := $(venv)/bin/python
+stamp  := $(venv)/.ready
 
 .DEFAULT_GOAL := help
 .PHONY: help demo test clean FORCE
@@ -12,18 +12,18 @@ help:
 	@echo 'make test    run the tests (ARGS="-k name" passes options to pytest)'
 	@echo 'make clean   remove the Python environment; the next make sets it up again'
 
-demo: $(STAMP)
-	$(PYTHON) examples/demo.py $(ARGS)
+demo: $(stamp)
+	$(python) examples/demo.py $(ARGS)
 
-test: $(STAMP)
-	$(PYTHON) -m pytest -q $(ARGS)
+test: $(stamp)
+	$(python) -m pytest -q $(ARGS)
 
 clean:
-	rm -rf $(VENV)
+	rm -rf $(venv)
 
-$(STAMP): pyproject.toml setup.sh
+$(stamp): pyproject.toml setup.sh
 	./setup.sh
 
-ifneq ("$(CURDIR)","$(shell test -x $(PYTHON) && cat $(STAMP) 2>/dev/null)")
-$(STAMP): FORCE
+ifneq ("$(CURDIR)","$(shell test -x $(python) && cat $(stamp) 2>/dev/null)")
+$(stamp): FORCE
 endif

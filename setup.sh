@@ -136,7 +136,9 @@ loads() { "$venv/bin/python" -c "import ctypes; ctypes.CDLL('$1')" 2>/dev/null; 
 # Slim images lack libatomic, which Dr.Jit needs. A library that the user chose by a variable is not ours to replace.
 provide_rays() {
     works rays && return
-    if ! loads libatomic.so.1 && apt_install first libatomic1; then
+    if [ "$(uname)" = Linux ] && ! loads libatomic.so.1; then
+        advice="Dr.Jit needs libatomic.so.1: type \`sudo apt-get install libatomic1\` (elsewhere libatomic, gcc-libs)"
+        apt_install first libatomic1 || return 1
         works rays && return
     fi
     [ -z "${DRJIT_LIBLLVM_PATH:-}" ] && can_install || return 1

@@ -23,9 +23,11 @@ from .errors import (  # noqa: E402
     SceneError,
     SettingsError,
 )
+from .evaluate.compare import compare  # noqa: E402
 from .lighting.environment import EnvironmentMap, LightWarning  # noqa: E402
 from .lighting.light import DirectionalLight, DistantLight  # noqa: E402
 from .precompute import precompute  # noqa: E402
+from .relight import relight_to_file  # noqa: E402
 from .render.integrator import register_integrator  # noqa: E402
 
 __version__ = "0.1.0"
@@ -42,8 +44,10 @@ __all__ = [
     "RuntimeSetupError",
     "SceneError",
     "SettingsError",
+    "compare",
     "load",
     "precompute",
+    "relight_to_file",
 ]
 
 register_integrator()

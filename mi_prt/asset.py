@@ -16,6 +16,7 @@ from .basis.pca import PCA
 from .directions import parse_directions
 from .errors import AssetError, SettingsError
 from .lighting.cells import cell_radiance
+from .lighting.lattice import on_lattice
 from .points.lattice import Patches
 from .points.points import Points
 
@@ -85,6 +86,15 @@ class Asset:
         mean_response : (3,) float32
         """
         return self.basis.project_light(cell_radiance(light, self.directions))
+
+    def prepare_light(self, light):
+        """The same light kept on a fine lattice, so that turning and projecting it takes milliseconds.
+
+        >>> sky = asset.prepare_light("sky.exr")
+        >>> for degrees in range(360):
+        ...     asset.relight(sky.rotated("y", degrees))
+        """
+        return on_lattice(light, self.directions)
 
     def irradiance(self, light):
         """Irradiance at the points under distant light, (n, 3) float32 in W/m². See `project_light` for `light`."""

@@ -9,18 +9,17 @@ from .errors import SettingsError
 
 MAX_CUBEMAP_RESOLUTION = 512  # 1.6 million directions: beyond any transport matrix this program could hold
 
-# Frame of each cube face: columns are the axes of the face coordinates (a, b) and of its outward normal.
-_FACES = np.array(
+# Frame of each cube face: its rows are the axes of the face coordinates (a, b) and the outward normal. The faces −x, −y, −z
+# are the point reflections of +x, +y, +z, so that cell j + s/2 is the antipode of cell j.
+_POSITIVE_FACES = np.array(
     [
         [[0, 0, -1], [0, 1, 0], [1, 0, 0]],  # +x
-        [[0, 0, 1], [0, 1, 0], [-1, 0, 0]],  # -x
         [[1, 0, 0], [0, 0, -1], [0, 1, 0]],  # +y
-        [[1, 0, 0], [0, 0, 1], [0, -1, 0]],  # -y
         [[1, 0, 0], [0, 1, 0], [0, 0, 1]],  # +z
-        [[-1, 0, 0], [0, 1, 0], [0, 0, -1]],  # -z
     ],
     dtype=np.float64,
 )
+_FACES = np.concatenate([_POSITIVE_FACES, -_POSITIVE_FACES])
 
 
 @dataclass(frozen=True)
@@ -29,7 +28,8 @@ class Cubemap:
 
     The cells of a face are equally wide in angle, not in the face's plane, so that the solid angles of one
     map differ by at most √2 instead of 5.2 and the resolution is the same in the middle of a face and at its
-    corners. Cell index: (face·N + row)·N + column, faces in the order +x, −x, +y, −y, +z, −z.
+    corners. Cell index: (face·N + row)·N + column, faces in the order +x, +y, +z, −x, −y, −z. The lattice is symmetric
+    about the origin: direction j + s/2 is the opposite of direction j.
 
     Parameters
     ----------
@@ -116,13 +116,12 @@ class Cubemap:
         on_x = (ax >= ay) & (ax >= az)
         on_y = ~on_x & (ay >= az)
         major = np.where(on_x, x, np.where(on_y, y, z))
-        negative = np.signbit(major)
-        scale = 1.0 / np.abs(major)
-        sign = np.where(negative, -scale, scale)
-        # Coordinates on the face; the signs follow the frames in _FACES.
-        a = np.where(on_x, -z * sign, np.where(on_y, x * scale, x * sign))
-        b = np.where(on_y, -z * sign, y * scale)
-        face = np.where(on_x, 0, np.where(on_y, 2, 4)) + negative
+        scale = 1 / major
+        # Coordinates in the frames of _FACES; the sign of the major axis reflects them on the negative faces.
+        z_scaled = -z * scale
+        a = np.where(on_x, z_scaled, x * scale)
+        b = np.where(on_y, z_scaled, y * scale)
+        face = np.where(on_x, 0, np.where(on_y, 1, 2)) + 3 * np.signbit(major)
         n = self.resolution
         column = _index_along(a, n)
         row = _index_along(b, n)

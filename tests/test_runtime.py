@@ -84,19 +84,13 @@ def test_search_is_fast_enough_for_each_import():
     assert min(seconds) < 0.03
 
 
-def test_selection_sets_an_unset_variable_and_loads_nothing(fake_library, tmp_path):
+@pytest.mark.parametrize("chosen", ["", "/chosen/libLLVM-14.so"])
+def test_importing_mi_prt_selects_unless_the_user_has(fake_library, tmp_path, chosen):
     fake_library("libLLVM-14.so")
     best = fake_library("libLLVM-22.so")
-    run = run_python("import os, sys; from mi_prt.llvm import select_llvm; select_llvm(); "
-                     "print(os.environ['DRJIT_LIBLLVM_PATH'], 'drjit' in sys.modules)", LD_LIBRARY_PATH=str(tmp_path))
-    assert run.stdout.split() == [best, "False"], run.stderr
-
-
-def test_selection_respects_a_variable_that_is_set(fake_library, tmp_path):
-    fake_library("libLLVM-22.so")
-    run = run_python("from mi_prt.llvm import select_llvm; print(select_llvm())", LD_LIBRARY_PATH=str(tmp_path),
-                     DRJIT_LIBLLVM_PATH="/chosen/libLLVM-14.so")
-    assert run.stdout.strip() == "/chosen/libLLVM-14.so", run.stderr
+    run = run_python("import os, mi_prt; print(os.environ['DRJIT_LIBLLVM_PATH'])",
+                     LD_LIBRARY_PATH=str(tmp_path), DRJIT_LIBLLVM_PATH=chosen)
+    assert run.stdout.strip() == (chosen or best), run.stderr
 
 
 @pytest.mark.parametrize(("name", "content", "said"), [

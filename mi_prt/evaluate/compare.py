@@ -80,7 +80,7 @@ def compare(
     progress("reference at the points", 1, 3)
     started = time.perf_counter()
     chosen = np.sort(np.random.default_rng(seed).permutation(len(asset.points))[:COMPARED_POINTS])
-    at_points = ground_truth.point_irradiance(truth, _subset(asset.points, chosen), POINT_SAMPLES, seed)
+    at_points = ground_truth.point_irradiance(truth, subset(asset.points, chosen), POINT_SAMPLES, seed)
 
     progress("reference image", 2, 3)
     with resized(pick_sensor(truth, sensor), size) as camera:
@@ -117,7 +117,8 @@ def _made_folder(folder):
     return folder
 
 
-def _subset(points, index):
+def subset(points, index):
+    """Some of the points, as far as a reference needs them: positions and normals."""
     return replace(points, **{name: getattr(points, name)[index] for name in ("positions", "normals", "geometric_normals")})
 
 

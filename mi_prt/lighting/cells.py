@@ -11,13 +11,15 @@ from .light import as_light
 SAMPLES_PER_CELL_SIDE = 16  # cell edges then cut the map to 1/16 of a cell
 
 
-def cell_radiance(light, directions):
+def cell_radiance(light, directions, samples_per_side=SAMPLES_PER_CELL_SIDE):
     """Mean radiance of each cell.
 
     Parameters
     ----------
     light : DistantLight or what `as_light` accepts
     directions : Cubemap
+    samples_per_side : int
+        Least number of samples along the side of a cell.
 
     Returns
     -------
@@ -26,7 +28,7 @@ def cell_radiance(light, directions):
     """
     light = as_light(light)
     radiance = np.zeros((len(directions), 3))
-    spacing = np.sqrt(4 * np.pi / len(directions)) / SAMPLES_PER_CELL_SIDE
+    spacing = np.sqrt(4 * np.pi / len(directions)) / samples_per_side
     for environment in light.maps:
         radiance += average(environment.quadrature(spacing), directions)
     for source in light.directionals:

@@ -15,7 +15,10 @@ from ..scene.scene import Scene, SceneSource
 
 def register_integrator():
     """Register the plugin `prt` in the variants of `runtime.VARIANTS`, now and whenever one is set."""
-    import mitsuba as mi
+    try:
+        import mitsuba as mi
+    except (ImportError, NameError):
+        return  # a broken installation: `mi-prt doctor` must still start, and everything else raises a typed error
 
     mi.detail.add_variant_callback(lambda old, new: _register(new))
     if mi.variant() is not None:

@@ -28,7 +28,7 @@ class DirectTransport:
     bits : (n, ceil(s·r/8)) uint8
         Visibility, packed along directions; a ray below the horizon counts as blocked.
     rays : int
-        Rays traced (those above the horizon).
+        Rays traced: one for every two directions, since the other is below the horizon.
     """
 
     normals: np.ndarray
@@ -93,61 +93,84 @@ def sample_direct(scene, points, directions, rays_per_direction=1, progress=lamb
     """
     vectors, fractions = directions.subdivided(rays_per_direction)
     tracer = VisibilityTracer(scene, points, vectors.reshape(-1, 3))
-    step = max(1, LANES // tracer.count)
+    step = max(1, LANES // tracer.lanes_per_point)
     packed = []
-    for first in range(0, len(points), step):
-        size = min(step, len(points) - first)
-        packed.append(np.packbits(tracer.trace(first, size), axis=1))
-        progress(first + size, len(points))
-    return DirectTransport(points.normals, vectors, fractions, np.concatenate(packed), tracer.rays)
+    for bits in tracer.stream((first, min(step, len(points) - first)) for first in range(0, len(points), step)):
+        packed.append(bits)
+        progress(sum(map(len, packed)), len(points))
+    rays = len(points) * tracer.lanes_per_point
+    return DirectTransport(points.normals, vectors, fractions, np.concatenate(packed), rays)
 
 
 class VisibilityTracer:
     """Occlusion rays from points into fixed directions, in blocks that share one kernel.
 
-    Everything that changes from block to block is opaque to the compiler; literals would compile a kernel each.
+    Of two opposite directions one lies above the horizon of any point, so a lane takes a pair of them and traces that one:
+    no lane is idle. What changes from block to block is opaque to the compiler; literals would compile a kernel each.
+
+    Parameters
+    ----------
+    scene : Scene
+    points : Points
+    vectors : (k, 3) float32
+        vectors[j + k/2] = −vectors[j].
     """
 
     def __init__(self, scene, points, vectors):
-        import drjit as dr
-
         mi = mitsuba()
         self.occluders = scene.occluders
-        self.count = len(vectors)
-        self.rays = 0
-        self._offset = dr.opaque(mi.Float, RAY_OFFSET * scene.scale)
-        self._vectors = mi.Float(vectors.ravel())
-        self._normals = mi.Float(points.normals.ravel())
-        self._geometric_normals = mi.Float(points.geometric_normals.ravel())
-        self._positions = mi.Float(points.positions.ravel())
+        self.lanes_per_point = len(vectors) // 2
+        # Rays start on the side of the surface that reflects. One that dips below the faces around its vertex (the
+        # hemisphere of a smooth normal can) runs into them and is blocked, as it is in Mitsuba's own rendering.
+        origins = points.positions + np.float32(RAY_OFFSET * scene.scale) * points.geometric_normals
+        self._vectors, self._origins, self._normals = (
+            mi.Float(np.pad(x, ((0, 0), (0, 1))).ravel())  # 4 floats each: gathered in one load
+            for x in (vectors[: self.lanes_per_point], origins, points.normals)
+        )
 
-    def block(self, first, size):
-        """The rays of points first…first+size, point by point, and which of them lie above the horizon."""
+    def rays(self, first, size):
+        """The rays above the horizon of points first…first+size, point by point, and whether each is the pair's first."""
         import drjit as dr
 
         mi = mitsuba()
-        lane = dr.arange(mi.UInt32, size * self.count)
-        count = dr.opaque(mi.UInt32, self.count)
-        local = lane // count
-        point = local + dr.opaque(mi.UInt32, first)
-        direction = dr.gather(mi.Vector3f, self._vectors, lane - local * count)
-        normal = dr.gather(mi.Vector3f, self._normals, point)
-        above = dr.dot(normal, direction) > 0
-        # Rays start on the side of the surface that reflects. One that dips below the faces around its vertex (the
-        # hemisphere of a smooth normal can) runs into them and is blocked, as it is in Mitsuba's own rendering.
-        origin = dr.gather(mi.Point3f, self._positions, point)
-        origin += self._offset * dr.gather(mi.Vector3f, self._geometric_normals, point)
-        return mi.Ray3f(origin, direction), above
 
-    def trace(self, first, size):
-        """Visibility (size, directions) bool of a block of points."""
+        def vectors(source, index):
+            v = dr.gather(mi.Vector4f, source, index)
+            return mi.Vector3f(v.x, v.y, v.z)
+
+        lane = dr.arange(mi.UInt32, size * self.lanes_per_point)
+        local = lane // self.lanes_per_point  # the divisor is the same in all blocks, so it may be a literal
+        point = local + dr.opaque(mi.UInt32, first)
+        direction = vectors(self._vectors, lane - local * self.lanes_per_point)
+        upward = dr.dot(vectors(self._normals, point), direction) > 0
+        return mi.Ray3f(vectors(self._origins, point), dr.select(upward, direction, -direction)), upward
+
+    def stream(self, blocks):
+        """Packed visibility (size, k/8) uint8 of each block (first, size); False below the horizon.
+
+        Each block is started before the one before it is read, so that rays are traced while bits are packed.
+        """
+        waiting = None
+        for first, size in blocks:
+            started = self._start(first, size), size
+            if waiting:
+                yield _packed(*waiting)
+            waiting = started
+        if waiting:
+            yield _packed(*waiting)
+
+    def _start(self, first, size):
         import drjit as dr
 
-        ray, above = self.block(first, size)
-        visible = above & ~self.occluders.ray_test(ray, False, above)
-        dr.eval(visible, above)
-        self.rays += int(dr.count(above)[0])
-        return np.array(visible).reshape(size, self.count)
+        ray, upward = self.rays(first, size)
+        visible = ~self.occluders.ray_test(ray)
+        halves = visible & upward, visible & ~upward
+        dr.eval(halves)  # returns at once; reading the arrays waits
+        return halves
+
+
+def _packed(halves, size):
+    return np.packbits(np.concatenate([np.array(half).reshape(size, -1) for half in halves], axis=1), axis=1)
 
 
 def find_buried(scene, points, dark):

@@ -1,0 +1,30 @@
+"""The Python API on a scene dict: points, transport, irradiance and outgoing radiance as NumPy arrays."""
+
+import numpy as np
+
+import mi_prt
+
+scene = {
+    "type": "scene",
+    "floor": {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.4, 0.5, 0.6]}}},
+    "ball": {"type": "sphere", "center": [0, 0, 0.4], "radius": 0.3},
+}
+asset = mi_prt.precompute(scene, directions="cubemap:16", coefficients=32)
+print(f"{len(asset.points):,} points, {asset.directions}, captured variance {asset.report['captured_variance']:.3f}")
+
+# A map of any size: here a bright band of sky around the horizon (+y is up in a map; this scene has +z up).
+height, width = 64, 128
+pixels = np.full((height, width, 3), 0.05, np.float32)
+pixels[height // 4 : height // 2] = [1.0, 0.9, 0.7]
+light = mi_prt.EnvironmentMap(pixels).rotated(axis="x", degrees=90)
+
+irradiance = asset.irradiance(light)  # (n, 3) W/m²
+radiance = asset.relight(light)  # (n, 3) W/(m²·sr)
+row = asset.transport([0])  # (1, s): the first point's transport as the basis holds it
+print("mean irradiance", irradiance.mean(axis=0), "mean outgoing radiance", radiance.mean(axis=0))
+print("transport of point 0, integrated over the sphere:", float(row[0] @ asset.directions.solid_angles))
+
+# Turning light: prepared once, then milliseconds for each angle.
+prepared = asset.prepare_light(light)
+for degrees in (0, 90, 180, 270):
+    print(degrees, "degrees:", asset.irradiance(prepared.rotated("z", degrees)).mean(axis=0))

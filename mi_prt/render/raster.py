@@ -1,0 +1,487 @@
+"""Raster images of an asset by pyrender: the triangles between its points, without tracing a ray at them.
+
+They show what the integrator `prt` shows: irradiance interpolated between points times albedo, and what is seen of the
+emitters. Differences remain at outlines (curved shapes are the polygons between their points), at edges within textures
+(a pixel has few samples), and where a texture is larger than 4096 texels over a surface.
+
+The program's own shaders draw linear radiance into a float32 image. pyrender's framebuffer would round each sample to 8
+bits and mix the colour of its background into outlines before the real background is known.
+
+Importing this module opens OpenGL.
+"""
+
+import warnings
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import RuntimeSetupError, SceneError, SettingsError
+from ..points.lattice import lattice_nodes, lattice_triangles
+from ..runtime import mitsuba, raster_install_command, raster_platform
+from ..runtime import pyrender as load_pyrender
+from ..scene.traversal import transform_of
+from .display import display
+
+pyrender = load_pyrender()  # chooses the OpenGL platform, before OpenGL is imported
+from OpenGL import GL  # noqa: E402
+from pyrender.renderer import Renderer  # noqa: E402
+from pyrender.shader_program import ShaderProgramCache  # noqa: E402
+
+SHADERS = Path(__file__).parent / "shaders"
+SENSORS = {"PerspectiveCamera": "perspective", "ThinLensCamera": "thinlens", "OrthographicCamera": "orthographic"}
+MAX_TEXELS = 4096  # along a side of a baked texture
+PROCEDURAL_TEXELS = 256  # along a period of a texture that is no bitmap
+BURIED_WEIGHT = 1e-5  # of buried points in interpolation: nothing beside others, all where there are no others
+
+
+def render_raster(asset, scene, irradiance, sensor, factor, samples=2):
+    """Displayed image of a scene lit from an asset. See `RasterScene`, which draws many.
+
+    Parameters
+    ----------
+    asset : Asset
+    scene : Scene
+    irradiance : (n, 3)
+        W/m² at the asset's points.
+    sensor : mi.Sensor
+    factor : float
+        Exposure, see `display`.
+    samples : int
+        Along each side of a pixel.
+
+    Returns
+    -------
+    (h, w, 3) float32
+        0…1, sRGB encoded.
+    """
+    with RasterScene(asset, scene, sensor, samples) as raster:
+        return raster.draw(irradiance, factor)
+
+
+class RasterScene:
+    """A scene as one sensor sees it, to be drawn under changing light; a context manager, see `close`.
+
+    Each pixel is the mean of its samples' linear radiance, as in Mitsuba with a box filter, whatever the film's own
+    filter is.
+
+    Parameters
+    ----------
+    asset : Asset
+    scene : Scene
+        That of the asset. Its environment is the background, its area lights are seen.
+    sensor : mi.Sensor
+        perspective, orthographic, or thinlens (drawn without its blur). The film's crop window is respected.
+    samples : int
+        Along each side of a pixel: 2 for four in all.
+
+    Raises
+    ------
+    SettingsError
+        If the sensor is of another kind, or the image too large for OpenGL.
+    SceneError
+        If the scene is not the asset's.
+    RuntimeSetupError
+        If OpenGL cannot be opened.
+
+    Notes
+    -----
+    Radiance of area lights is interpolated between their points. Shapes that have no points are not drawn.
+    """
+
+    def __init__(self, asset, scene, sensor, samples=2):
+        if samples < 1:
+            raise SettingsError(f"samples must be ≥ 1 along each side of a pixel, got {samples}")
+        _check_surfaces(scene, asset.points)
+        self._view = _view_of(sensor)
+        self._scene, self._samples = scene, samples
+        self._weight = np.where(asset.buried, np.float32(BURIED_WEIGHT), np.float32(1))[:, None]
+        self._reflection, self._emission, albedo = _shading(scene, asset.points)
+        self._parts = _parts(scene, asset.points)
+        width, height = self._view.size
+        self._canvas = _open_canvas(width * samples, height * samples)
+        self._primitives = [_primitive(part, asset.points, albedo) for part in self._parts]
+        self._drawing = _drawing(self._primitives, self._view)
+        self._sky = None
+
+    def draw(self, irradiance, factor, background=None):
+        """Displayed image (h, w, 3) float32, 0…1. See `radiance` and `display`."""
+        return display(self.radiance(irradiance, background), factor)
+
+    def radiance(self, irradiance, background=None):
+        """Image of linear radiance.
+
+        Parameters
+        ----------
+        irradiance : (n, 3)
+            W/m² at the asset's points.
+        background : mi.Scene, optional
+            Whose environment is seen; by default that of the scene, as it is now.
+
+        Returns
+        -------
+        (h, w, 3) float32
+        """
+        if np.shape(irradiance) != self._emission.shape:
+            raise SettingsError(f"irradiance must be of shape {self._emission.shape}, got {np.shape(irradiance)}")
+        light = np.hstack([self._weight * (self._reflection * irradiance + self._emission), self._weight])
+        _make_current()
+        for part, primitive in zip(self._parts, self._primitives):
+            primitive.color_0 = light[part.points]
+            if primitive._in_context():
+                primitive._remove_from_context()
+                primitive._add_to_context()
+        drawn = self._canvas.render(self._drawing, pyrender.RenderFlags.OFFSCREEN)
+        self._add_background(drawn, (background or self._scene.mi_scene).environment())
+        k = self._samples
+        return sum(drawn[i::k, j::k, :3] for i in range(k) for j in range(k)) / np.float32(k * k)
+
+    def close(self):
+        """Free what OpenGL holds."""
+        _make_current()
+        self._canvas.delete()
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *exception):
+        self.close()
+
+    def _add_background(self, drawn, environment):
+        """Fill the samples (h, w, 4) that no triangle covers with the radiance of an emitter, or leave them black."""
+        import drjit as dr
+
+        uncovered = drawn[..., 3] == 0
+        if environment is None or not uncovered.any():
+            return
+        if self._sky is None:  # the same directions in each image
+            row, column = np.nonzero(uncovered)
+            height, width = uncovered.shape
+            directions = self._view.directions((column + 0.5) / width, (row + 0.5) / height)
+            self._sky = dr.zeros(mitsuba().SurfaceInteraction3f, len(row))
+            self._sky.wi = mitsuba().Vector3f(-directions.T.astype(np.float32))
+        drawn[uncovered, :3] = _rgb(environment.eval(self._sky), uncovered.sum())
+
+
+# --- the sensor ----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _View:
+    """Where a sensor puts the world. Positions in the image go from (0, 0), upper left, to (1, 1), lower right.
+
+    Parameters
+    ----------
+    size : (width, height)
+    to_clip : (4, 4) float64
+        World to OpenGL's clip space.
+    eye : (4,)
+        Position of the viewer; for parallel rays the direction to it, with w = 0.
+    depth : (4,)
+        Dot product with a position (x, y, z, 1): 0 at the near plane, 1 at the far plane.
+    """
+
+    size: tuple
+    to_clip: np.ndarray
+    eye: np.ndarray
+    depth: np.ndarray
+
+    def directions(self, x, y):
+        """Unit directions (k, 3) of rays through positions x, y (k,) in the image."""
+        ones = np.ones_like(x)
+        far = np.linalg.solve(self.to_clip, [2 * x - ones, ones - 2 * y, ones, ones])
+        directions = (far[:3] / far[3] - self.eye[:3, None] if self.eye[3] else -self.eye[:3, None] * ones).T
+        return directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+def _view_of(sensor):
+    """The view of a sensor, from its own rays through two corners of the image."""
+    kind = sensor.class_name()
+    if kind not in SENSORS:
+        raise SettingsError(f"the raster renderer draws {', '.join(SENSORS.values())} sensors, not {kind}: use mitsuba")
+    if kind == "ThinLensCamera":
+        warnings.warn("the raster renderer draws a thinlens sensor as a pinhole, all in focus", stacklevel=3)
+    mi = mitsuba()
+    to_world = transform_of(sensor)
+    to_camera = np.linalg.inv(to_world)
+    corners = sensor.sample_ray(0.0, 0.5, mi.Point2f([0, 1], [0, 1]), mi.Point2f(0.5))[0]
+    near, far = sensor.near_clip(), sensor.far_clip()
+    # In Mitsuba's camera space, x to the left, y up, and z forward. Clip space is x to the right, -1 to 1 times w.
+    projection = np.zeros((4, 4))
+    if kind == "OrthographicCamera":
+        (x0, x1), (y0, y1), _ = to_camera[:3, :3] @ np.array(corners.o, np.float64) + to_camera[:3, 3:]
+        eye, centre = -to_world[:, 2], 3
+        projection[2:] = [[0, 0, 2, -far - near], [0, 0, 0, far - near]]
+    else:
+        x, y, z = to_camera[:3, :3] @ np.array(corners.d, np.float64)
+        (x0, x1), (y0, y1) = x / z, y / z
+        eye, centre = to_world[:, 3], 2
+        projection[2:] = [[0, 0, far + near, -2 * far * near], [0, 0, far - near, 0]]
+    projection[2:] /= far - near
+    projection[0, [0, centre]] = np.array([2, -x0 - x1]) / (x1 - x0)
+    projection[1, [1, centre]] = np.array([2, -y0 - y1]) / (y0 - y1)
+    depth = np.array([0, 0, 1, -near]) / (far - near) @ to_camera
+    return _View(tuple(map(int, sensor.film().crop_size())), projection @ to_camera, eye, depth)
+
+
+# --- triangles and what they reflect -------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """Triangles that share a texture.
+
+    Parameters
+    ----------
+    points : (v,) int
+        The asset's point at each vertex.
+    uv : (v, 2) float32
+        Into the texture, 0…1.
+    triangles : (m, 3) int
+        Of vertices.
+    texture : (h, w, 3) float16 or None
+        Albedo; None where the points' own is enough.
+    """
+
+    points: np.ndarray
+    uv: np.ndarray
+    triangles: np.ndarray
+    texture: np.ndarray | None
+
+
+def _check_surfaces(scene, points):
+    if [s.kind for s in scene.surfaces] != [s["kind"] for s in points.surfaces]:
+        raise SceneError("the scene's shapes are not those of the asset: pass the scene that it was precomputed from")
+    bare = [s["name"] for s in points.surfaces if not s["patches"]]
+    if bare:
+        warnings.warn(f"the raster renderer leaves out shapes without points: {', '.join(bare)}", stacklevel=3)
+
+
+def _parts(scene, points):
+    """The triangles of both sides: one part for each side of a textured surface, one for all other surfaces."""
+    backs = _backs(points)
+    fronts = points.patches.triangles()
+    surface = points.surface[fronts[:, 0]]
+    textured = np.array([_is_baked(s) for s in scene.surfaces])
+    plain = fronts[~textured[surface]]
+    back = backs[points.surface[plain[:, 0]], None]
+    plain = np.concatenate([plain, (plain + back)[back[:, 0] > 0]])
+    parts = [_Part(np.arange(len(points)), np.zeros_like(points.uv), plain, None)] if len(plain) else []
+    for i in np.unique(surface[textured[surface]]):
+        vertices, uv, triangles = _textured_triangles(points, i, fronts[surface == i])
+        low, high = uv.min(axis=0), uv.max(axis=0)
+        extent = np.maximum(high - low, 1e-6)
+        for side in (1, -1) if backs[i] else (1,):
+            texture = _bake(scene.surfaces[i], side, low, extent)
+            parts.append(_Part(vertices + (backs[i] if side < 0 else 0), (uv - low) / extent, triangles, texture))
+    return parts
+
+
+def _backs(points):
+    """What takes a point of each surface to the point behind it, (surfaces,) int; 0 where the back does not reflect."""
+    return np.array([points.patches.back[s["first_patch"]] if s["patches"] else 0 for s in points.surfaces])
+
+
+def _textured_triangles(points, index, fronts):
+    """Vertices (v,) as points, their uv (v, 2), and triangles (m, 3) of vertices, of a surface's front."""
+    if points.surfaces[index]["kind"] == "mesh":
+        vertices, triangles = np.unique(fronts, return_inverse=True)
+        return vertices, points.uv[vertices], triangles.reshape(-1, 3)
+    # Points on the seam of an analytic shape have two uv: each node of its patch is a vertex.
+    patches, patch = points.patches, points.surfaces[index]["first_patch"]
+    levels = patches.levels[patch]
+    nodes = lattice_nodes(*levels)
+    vertices = patches.nodes[patches.offsets[patch] :][: len(nodes)]
+    return vertices, (nodes / levels).astype(np.float32), lattice_triangles(*levels)
+
+
+def _shading(scene, points):
+    """What takes irradiance E at the points to a light r·E + e that, times albedo a, is their radiance.
+
+    Returns
+    -------
+    reflection, emission : (n, 3) float32
+    albedo : (n, 4) float32
+        The fourth is 1 where the other side of the surface has points too.
+    """
+    reflection = np.full((len(points), 3), 1 / np.pi, np.float32)
+    emission = np.zeros((len(points), 3), np.float32)
+    albedo = np.hstack([points.albedo, (_backs(points)[points.surface] > 0)[:, None]]).astype(np.float32)
+    for i, surface in enumerate(scene.surfaces):
+        if surface.shape.emitter() is None or not points.surfaces[i]["patches"]:
+            continue
+        own = np.flatnonzero(points.surface == i)
+        reflection[own] *= points.albedo[own]
+        albedo[own, :3] = 1
+        front = own[: len(own) // 2] if albedo[own[0], 3] else own
+        emission[front] = _emitted(surface, points.uv[front])
+    return reflection, emission, albedo
+
+
+def _emitted(surface, uv):
+    """Radiance (k, 3) of an area light towards its front at some uv (k, 2)."""
+    return _rgb(surface.shape.emitter().eval(_interaction(surface, uv)), len(uv))
+
+
+def _is_baked(surface):
+    """Whether a surface has textures over uv. For attributes of meshes, and on lights, the points' albedo must do."""
+    modelled = surface.material.modelled
+    has_map = any(key.endswith("to_uv") for key in mitsuba().traverse(modelled).keys())
+    return has_map and "MeshAttribute" not in str(modelled) and surface.shape.emitter() is None
+
+
+def _bake(surface, side, low, extent):
+    """Albedo (h, w, 3) float16 of a side of a surface over the box low + [0, extent] of uv."""
+    width, height = _texels(surface.material.modelled, extent)
+    v, u = (np.indices((height, width)).reshape(2, -1) + 0.5) / [[height], [width]]
+    uv = (low + np.stack([u, v], axis=-1) * extent).astype(np.float32)
+    albedo = surface.material.modelled.eval_diffuse_reflectance(_interaction(surface, uv, side))
+    return _rgb(albedo, len(uv)).astype(np.float16).reshape(height, width, 3)
+
+
+def _texels(bsdf, extent):
+    """Texels (width, height) that show each texel of a material's bitmaps over an extent (2,) of uv."""
+    parameters = mitsuba().traverse(bsdf)
+    wanted = [(1, 1)]
+    for key in parameters.keys():
+        if key.endswith("to_uv"):
+            data = key.removesuffix("to_uv") + "data"
+            shape = parameters[data].shape[1::-1] if data in parameters else (PROCEDURAL_TEXELS, PROCEDURAL_TEXELS)
+            to_texels = np.array(parameters[key].matrix, dtype=np.float64)[:2, :2] * np.reshape(shape, (2, 1))
+            wanted.append(np.linalg.norm(to_texels, axis=0) * extent)
+    return np.clip(np.rint(np.max(wanted, axis=0)), 1, MAX_TEXELS).astype(int)
+
+
+def _interaction(surface, uv, side=1):
+    """Points at some uv (k, 2) of a surface, seen straight from its front (1) or back (-1)."""
+    import drjit as dr
+
+    mi = mitsuba()
+    si = dr.zeros(mi.SurfaceInteraction3f, len(uv))
+    si.uv = mi.Point2f(uv.T)
+    si.n = mi.Normal3f(0, 0, 1)
+    si.sh_frame = mi.Frame3f(mi.Normal3f(0, 0, 1))
+    si.wi = mi.Vector3f(0, 0, side)
+    si.shape = mi.ShapePtr(surface.shape)
+    return si
+
+
+def _rgb(colour, count):
+    """A Mitsuba colour as (count, 3)."""
+    return np.broadcast_to(np.array(mitsuba().Color3f(colour)).reshape(3, -1).T, (count, 3))
+
+
+# --- OpenGL, by way of pyrender ------------------------------------------------------------------------------------
+
+
+class _Canvas(Renderer):
+    """pyrender's renderer with the shaders of this program and one float32 image, (h, w, 4), without multisampling."""
+
+    def __init__(self, width, height):
+        super().__init__(width, height)
+        self._program_cache = ShaderProgramCache(str(SHADERS))
+
+    def _bind_lighting(self, scene, program, node, flags):
+        view = scene.main_camera_node.camera.view
+        program.set_uniform("eye", view.eye)
+        program.set_uniform("depth", view.depth)
+
+    def _configure_main_framebuffer(self):
+        if self._main_fb_ms is None:  # pyrender's name for the framebuffer that it draws to
+            self._main_fb_ms, self._buffers = GL.glGenFramebuffers(1), GL.glGenRenderbuffers(2)
+            GL.glBindFramebuffer(GL.GL_FRAMEBUFFER, self._main_fb_ms)
+            self._attach(self._buffers[0], GL.GL_RGBA32F, GL.GL_COLOR_ATTACHMENT0)
+            self._attach(self._buffers[1], GL.GL_DEPTH_COMPONENT32F, GL.GL_DEPTH_ATTACHMENT)
+
+    def _attach(self, buffer, pixels, place):
+        GL.glBindRenderbuffer(GL.GL_RENDERBUFFER, buffer)
+        GL.glRenderbufferStorage(GL.GL_RENDERBUFFER, pixels, self.viewport_width, self.viewport_height)
+        GL.glFramebufferRenderbuffer(GL.GL_FRAMEBUFFER, place, GL.GL_RENDERBUFFER, buffer)
+
+    def _delete_main_framebuffer(self):
+        if self._main_fb_ms is not None:
+            GL.glDeleteFramebuffers(1, [self._main_fb_ms])
+            GL.glDeleteRenderbuffers(2, self._buffers)
+            self._main_fb_ms = None
+
+    def _read_main_framebuffer(self, scene, flags):
+        width, height = self.viewport_width, self.viewport_height
+        GL.glBindFramebuffer(GL.GL_READ_FRAMEBUFFER, self._main_fb_ms)
+        return GL.glReadPixels(0, 0, width, height, GL.GL_RGBA, GL.GL_FLOAT).reshape(height, width, 4)[::-1]
+
+
+class _Camera(pyrender.Camera):
+    def __init__(self, view):
+        super().__init__()
+        self.view = view
+
+    def get_projection_matrix(self, width=None, height=None):
+        return self.view.to_clip
+
+
+class _Albedo(pyrender.Texture):
+    """A texture in half precision, linear; pyrender's own have 8 bits, too few for dark albedo."""
+
+    def __init__(self, texels):
+        clamp = pyrender.GLTF.CLAMP_TO_EDGE
+        sampler = pyrender.Sampler(None, GL.GL_LINEAR, GL.GL_LINEAR_MIPMAP_LINEAR, clamp, clamp)
+        super().__init__(sampler=sampler, source_channels="RGB", width=texels.shape[1], height=texels.shape[0])
+        self._texels = texels
+
+    def _add_to_context(self):
+        super()._add_to_context()
+        self._bind()
+        texels = self._texels.astype(np.float32)
+        GL.glTexImage2D(GL.GL_TEXTURE_2D, 0, GL.GL_RGB16F, self.width, self.height, 0, GL.GL_RGB, GL.GL_FLOAT, texels)
+        GL.glGenerateMipmap(GL.GL_TEXTURE_2D)
+        self._unbind()
+
+
+def _primitive(part, points, albedo):
+    """A part as pyrender draws it; its light is set later."""
+    texture = None if part.texture is None else _Albedo(part.texture)
+    return pyrender.Primitive(
+        points.positions[part.points],
+        normals=points.normals[part.points],
+        tangents=albedo[part.points],
+        texcoord_0=part.uv,
+        indices=part.triangles,
+        material=pyrender.MetallicRoughnessMaterial(baseColorTexture=texture, doubleSided=True),
+    )
+
+
+def _drawing(primitives, view):
+    """pyrender's scene of some primitives, over nothing."""
+    drawing = pyrender.Scene(bg_color=np.zeros(4))
+    drawing.add(pyrender.Mesh(primitives))
+    drawing.add(_Camera(view))
+    return drawing
+
+
+@cache
+def _context():
+    """OpenGL's context: one for the process, because EGL ends all when it closes one."""
+    platform = raster_platform()
+    try:
+        return pyrender.OffscreenRenderer(1, 1)
+    except Exception as error:  # each platform raises errors of its own kind
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise RuntimeSetupError(
+            f"OpenGL cannot be opened through {platform} ({reason}); install what is missing with "
+            f"`{raster_install_command()}`"
+        ) from error
+
+
+def _make_current():
+    _context()._platform.make_current()
+
+
+def _open_canvas(width, height):
+    _make_current()
+    limit = GL.glGetIntegerv(GL.GL_MAX_RENDERBUFFER_SIZE)
+    if max(width, height) > limit:
+        raise SettingsError(
+            f"a raster image of {width}x{height} samples is above OpenGL's limit of {limit} a side: make it smaller"
+        )
+    return _Canvas(width, height)
