@@ -16,7 +16,7 @@ from mi_prt.render.image import render_image, resized
 from mi_prt.scene.scene import open_scene
 
 ROOT = Path(__file__).resolve().parent.parent
-SCENE = ROOT / "scenes" / "teapot.xml"
+SCENE = ROOT / "scenes" / "still_life.xml"
 FRAME_SIZE = (400, 300)
 
 
@@ -30,7 +30,7 @@ def main():
 
     say(f"1. precompute the transport of {SCENE.name} (once)")
     asset = mi_prt.precompute(SCENE, coefficients=128, rays_per_direction=4)
-    asset.save(arguments.out / "teapot.prt")
+    asset.save(arguments.out / "still_life.prt")
     say(f"   {len(asset.points):,} points, {asset.report['rays']:,} rays, {asset.report['captured_variance']:.2%} of the variance")
 
     say("2. turn the sky around it")
@@ -50,7 +50,7 @@ def main():
     )
     say(f"done in {time.perf_counter() - started:.0f} s")
     for what, path in (
-        ("asset", arguments.out / "teapot.prt"),
+        ("asset", arguments.out / "still_life.prt"),
         ("turning sky", sky),
         ("raster image", raster),
         ("comparison, side by side", arguments.out / "report" / "side_by_side.png"),

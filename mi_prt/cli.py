@@ -10,7 +10,8 @@ from typing import Annotated, Optional
 
 import typer
 
-from .errors import InputError, PrtError, SettingsError
+from .errors import PrtError, SettingsError
+from .evaluate.report import finite
 
 app = typer.Typer(
     name="mi-prt",
@@ -283,7 +284,7 @@ def _is_hdf5(path):
 
 
 def _print_json(value):
-    print(json.dumps(value, allow_nan=True))
+    print(json.dumps(finite(value), allow_nan=False))
 
 
 def _note(text):

@@ -98,6 +98,7 @@ def measure(scene, parameters=None, progress=None, **settings):
     clock = _Clock()
     with count_kernels() as kernels:
         scene = open_scene(scene, parameters)
+        description = describe_scene(scene)
         clock.lap("scene")
         points = sample_points(scene, settings.edge_length)
         directions = parse_directions(settings.directions)
@@ -123,7 +124,7 @@ def measure(scene, parameters=None, progress=None, **settings):
         directions,
         basis,
         coefficients,
-        scene=describe_scene(scene),
+        scene=description,
         settings=asdict(settings) | {"coefficients": len(basis.vectors), "edge_length": points.report["edge_length"]},
         versions=versions(),
         report=report,

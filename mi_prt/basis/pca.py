@@ -14,6 +14,7 @@ BLOCK_ROWS = 128  # rows worked on at a time: a block of a few MB stays in the p
 OVERSAMPLING = 16
 SAMPLE_ITERATIONS = 2  # power iterations on a quarter of the rows, which find nearly the subspace of all
 ITERATIONS = 1  # power iterations on all rows, before the final projection
+RANK_TOLERANCE = 100 * float(np.finfo(np.float32).eps) ** 2  # of squared singular values, against the sum of squares
 EXACT_SIDE = 768  # up to here the Gram matrix of the smaller side is decomposed outright, in float64
 
 
@@ -116,9 +117,8 @@ def fit_pca(rows, index, weights, components, seed=0):
         values, vectors = _exact(rows, index, mean, sqrt_weights, components)
     else:
         values, vectors = _subspace_iteration(rows, index, mean, sqrt_weights, components, subspace, seed)
-    # Directions whose singular value is rounding noise carry nothing (NumPy's rank tolerance, on squares).
-    tolerance = (max(n, s) * np.finfo(np.float32).eps) ** 2
-    rank = int((values > tolerance * max(values.max(initial=0.0), squares)).sum())
+    # Rows are float32: what is below their rounding carries nothing.
+    rank = int((values > RANK_TOLERANCE * squares).sum())
     captured = values[:rank] / variance if variance > 0 else values[:rank]
     return PCA(
         np.ascontiguousarray(_fixed_signs(vectors[:, :rank]).T, dtype=np.float32),
@@ -149,23 +149,30 @@ def _subspace_iteration(rows, index, mean, sqrt_weights, components, subspace, s
     sample = index[:: 4 if len(index) > 40 * subspace else 1]
     for part in [sample] * SAMPLE_ITERATIONS + [index] * ITERATIONS:
         basis = np.linalg.qr(_covariance_times(rows, part, mean, sqrt_weights, basis))[0].astype(np.float32)
-    ritz = basis.T.astype(np.float64) @ _covariance_times(rows, index, mean, sqrt_weights, basis)
-    values, rotation = scipy.linalg.eigh((ritz + ritz.T) / 2)
+    ritz = np.zeros((subspace, subspace))
+    for _, narrow in _narrow(rows, index, mean, sqrt_weights, basis):
+        ritz += narrow.T @ narrow
+    values, rotation = scipy.linalg.eigh(ritz)
     leading = slice(None, -components - 1, -1)
     return np.maximum(values[leading], 0), basis @ rotation[:, leading]
 
 
 def _covariance_times(rows, index, mean, sqrt_weights, basis):
-    """XᵀX·basis for the centred, weighted rows X; weights and mean are applied to the narrow side only."""
-    weighted = basis * sqrt_weights[:, None]
-    centre = (mean @ basis).astype(np.float32)
+    """XᵀX·basis for the centred, weighted rows X."""
     product = np.zeros(basis.shape)
     total = np.zeros(basis.shape[1])
-    for block in _blocks(rows, index):
-        narrow = block @ weighted - centre
+    for block, narrow in _narrow(rows, index, mean, sqrt_weights, basis):
         product += block.T @ narrow
         total += narrow.sum(axis=0, dtype=np.float64)
     return product * sqrt_weights[:, None] - np.outer(mean, total)
+
+
+def _narrow(rows, index, mean, sqrt_weights, basis):
+    """Blocks of rows and their product X·basis; weights and mean are applied to the narrow side only."""
+    weighted = basis * sqrt_weights[:, None]
+    centre = (mean @ basis).astype(np.float32)
+    for block in _blocks(rows, index):
+        yield block, block @ weighted - centre
 
 
 def _exact(rows, index, mean, sqrt_weights, components):

@@ -59,8 +59,17 @@ def write_report(folder, report, result, reference, covered):
     for name, picture in (("result", shown), ("reference", truth), ("error", error), ("flip", flip_map)):
         _write_png(folder / f"{name}.png", picture)
     _write_png(folder / "side_by_side.png", np.concatenate([shown, truth, error], axis=1))
-    (folder / "report.json").write_text(json.dumps(report, indent=2) + "\n")
+    (folder / "report.json").write_text(json.dumps(finite(report), indent=2, allow_nan=False) + "\n")
     (folder / "index.html").write_text(_page(report))
+
+
+def finite(value):
+    """Plain data with null for numbers that JSON cannot hold (the PSNR of equal images is infinite)."""
+    if isinstance(value, dict):
+        return {key: finite(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(entry) for entry in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def _error_map(result, reference, covered):

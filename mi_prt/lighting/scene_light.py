@@ -9,7 +9,8 @@ from .environment import EnvironmentMap
 from .light import DirectionalLight, DistantLight, as_light
 
 BAKED_HEIGHT = 512  # rows of the map that an analytic sky is baked to
-SUN_SPLITS = 256  # samples across a pixel in which a sun was found
+SUN_SAMPLES = 1 << 24  # samples shared by the pixels in which a sun was found
+MOST_SPLITS = 256  # samples across one of them
 SUN_SEARCH = 1 << 16  # emitter samples that look for a sun
 
 
@@ -153,11 +154,10 @@ def _baked(emitter):
     for i in (-1, 0, 1):
         for j in (-1, 0, 1):
             marked[np.clip(row[brighter] + i, 0, height - 1), (column[brighter] + j) % width] = True
-    # A sun fills a handful of pixels. Where much of the sky is marked it is merely steep, and the map is good enough.
     found = np.argwhere(marked)
-    if 0 < len(found) <= 256:
-        for pixel in found:
-            pixels[tuple(pixel)] = _pixel_means(emitter, pixel[None], height, SUN_SPLITS)[0]
+    if len(found):
+        splits = min(MOST_SPLITS, max(4, int((SUN_SAMPLES / len(found)) ** 0.5)))
+        pixels[marked] = _pixel_means(emitter, found, height, splits)
     return EnvironmentMap(pixels)
 
 

@@ -31,7 +31,7 @@ from pyrender.shader_program import ShaderProgramCache  # noqa: E402
 
 SHADERS = Path(__file__).parent / "shaders"
 SENSORS = {"PerspectiveCamera": "perspective", "ThinLensCamera": "thinlens", "OrthographicCamera": "orthographic"}
-MAX_TEXELS = 4096  # along a side of a baked texture
+MIN_TEXELS, MAX_TEXELS = 512, 4096  # along a side of a baked texture
 PROCEDURAL_TEXELS = 256  # along a period of a texture that is no bitmap
 BURIED_WEIGHT = 1e-5  # of buried points in interpolation: nothing beside others, all where there are no others
 
@@ -303,18 +303,19 @@ def _shading(scene, points):
     -------
     reflection, emission : (n, 3) float32
     albedo : (n, 4) float32
-        The fourth is 1 where the other side of the surface has points too.
+        The fourth is 1 where the other side of the surface has points too, plus 2 on analytic shapes.
     """
     reflection = np.full((len(points), 3), 1 / np.pi, np.float32)
     emission = np.zeros((len(points), 3), np.float32)
-    albedo = np.hstack([points.albedo, (_backs(points)[points.surface] > 0)[:, None]]).astype(np.float32)
+    flags = (_backs(points) > 0) + 2 * np.array([s["kind"] != "mesh" for s in points.surfaces])
+    albedo = np.hstack([points.albedo, flags[points.surface, None]]).astype(np.float32)
     for i, surface in enumerate(scene.surfaces):
         if surface.shape.emitter() is None or not points.surfaces[i]["patches"]:
             continue
         own = np.flatnonzero(points.surface == i)
         reflection[own] *= points.albedo[own]
         albedo[own, :3] = 1
-        front = own[: len(own) // 2] if albedo[own[0], 3] else own
+        front = own[: len(own) // 2] if flags[i] % 2 else own
         emission[front] = _emitted(surface, points.uv[front])
     return reflection, emission, albedo
 
@@ -341,7 +342,11 @@ def _bake(surface, side, low, extent):
 
 
 def _texels(bsdf, extent):
-    """Texels (width, height) that show each texel of a material's bitmaps over an extent (2,) of uv."""
+    """Texels (width, height) that show a material's bitmaps over an extent (2,) of uv.
+
+    Those of the bitmap itself, so that nothing is resampled; a multiple of them where they are few, so that it does not
+    matter if the bitmap is turned against uv.
+    """
     parameters = mitsuba().traverse(bsdf)
     wanted = [(1, 1)]
     for key in parameters.keys():
@@ -350,7 +355,8 @@ def _texels(bsdf, extent):
             shape = parameters[data].shape[1::-1] if data in parameters else (PROCEDURAL_TEXELS, PROCEDURAL_TEXELS)
             to_texels = np.array(parameters[key].matrix, dtype=np.float64)[:2, :2] * np.reshape(shape, (2, 1))
             wanted.append(np.linalg.norm(to_texels, axis=0) * extent)
-    return np.clip(np.rint(np.max(wanted, axis=0)), 1, MAX_TEXELS).astype(int)
+    texels = np.max(wanted, axis=0)
+    return np.minimum(np.rint(texels * np.ceil(MIN_TEXELS / texels)), MAX_TEXELS).astype(int)
 
 
 def _interaction(surface, uv, side=1):

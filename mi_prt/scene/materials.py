@@ -64,7 +64,7 @@ class Material:
         si.sh_frame.s, si.sh_frame.t = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)
         si.dp_du, si.dp_dv = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)
         si.uv = sampler.next_2d()
-        si.wi = mi.Vector3f(np.sqrt(0.5), 0, np.sqrt(0.5))
+        si.wi = mi.Vector3f(0.5**0.5, 0, 0.5**0.5)
         _, weight = self.bsdf.sample(mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d())
         scattered = float(np.mean(np.array(weight)))
         diffuse = float(np.mean(np.array(self.modelled.eval_diffuse_reflectance(si))))

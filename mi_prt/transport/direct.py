@@ -21,26 +21,24 @@ class DirectTransport:
     Parameters
     ----------
     normals : (n, 3) float32
-    vectors : (s, r, 3) float32
-        The r directions sampled in each cell.
-    fractions : (s, r) float32
-        Share of the cell's solid angle that each stands for.
+    vectors : (2, r, s/2, 3) float32
+        The r directions sampled in each cell, scaled by the share of the cell's solid angle that each stands for; the
+        second half of the cells are the antipodes of the first.
     bits : (n, ceil(s·r/8)) uint8
-        Visibility, packed along directions; a ray below the horizon counts as blocked.
+        Visibility, packed in the order of `vectors`; a ray below the horizon counts as blocked.
     rays : int
         Rays traced: one for every two directions, since the other is below the horizon.
     """
 
     normals: np.ndarray
     vectors: np.ndarray
-    fractions: np.ndarray
     bits: np.ndarray
     rays: int
 
     @property
     def shape(self):
         """(n, s)."""
-        return len(self.normals), len(self.vectors)
+        return len(self.normals), 2 * self.vectors.shape[2]
 
     def rows(self, index):
         """Rows of the transport matrix.
@@ -54,14 +52,13 @@ class DirectTransport:
         (b, s) float32
             Irradiance per unit radiance of each cell, per steradian.
         """
-        s, r, _ = self.vectors.shape
-        visible = np.unpackbits(self.bits[index], axis=1, count=s * r)
+        shape = self.vectors.shape[:3]
         cosines = self.normals[index] @ self.vectors.reshape(-1, 3).T
         np.maximum(cosines, 0, out=cosines)
-        cosines *= visible
-        if r == 1:
-            return cosines
-        return np.einsum("bsr,sr->bs", cosines.reshape(-1, s, r), self.fractions)
+        cosines *= np.unpackbits(self.bits[index], axis=1, count=cosines.shape[1])
+        if shape[1] > 1:
+            cosines = cosines.reshape(-1, *shape).sum(axis=2)
+        return cosines.reshape(-1, self.shape[1])
 
     def blocks(self, size=128):
         """All rows in order, `size` at a time."""
@@ -92,6 +89,9 @@ def sample_direct(scene, points, directions, rays_per_direction=1, progress=lamb
     DirectTransport
     """
     vectors, fractions = directions.subdivided(rays_per_direction)
+    # From (s, r) to (2, r, s/2): opposite directions half the rays apart, and the rays of a cell summed along a row.
+    order = np.arange(len(directions) * rays_per_direction).reshape(2, -1, rays_per_direction).transpose(0, 2, 1)
+    vectors, fractions = vectors.reshape(-1, 3)[order], fractions.ravel()[order]
     tracer = VisibilityTracer(scene, points, vectors.reshape(-1, 3))
     step = max(1, LANES // tracer.lanes_per_point)
     packed = []
@@ -99,7 +99,7 @@ def sample_direct(scene, points, directions, rays_per_direction=1, progress=lamb
         packed.append(bits)
         progress(sum(map(len, packed)), len(points))
     rays = len(points) * tracer.lanes_per_point
-    return DirectTransport(points.normals, vectors, fractions, np.concatenate(packed), rays)
+    return DirectTransport(points.normals, vectors * fractions[..., None], np.concatenate(packed), rays)
 
 
 class VisibilityTracer:

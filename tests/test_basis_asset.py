@@ -1,0 +1,513 @@
+"""The basis against NumPy's SVD, and the asset file: what it holds, that it can be trusted, and how it fails."""
+
+import hashlib
+import json
+import os
+import subprocess
+import sys
+
+import h5py
+import numpy as np
+import pytest
+
+import mi_prt
+import mi_prt.transport.direct
+from conftest import bias, cube, diffuse, disk, rectangle, relative_l2, scene, sphere, uniform_sky
+from mi_prt import AssetError, SettingsError
+from mi_prt.asset import Asset
+from mi_prt.basis.pca import EXACT_SIDE, fit_pca
+from mi_prt.directions import Cubemap
+from mi_prt.lighting.cells import cell_radiance
+from mi_prt.precompute import measure
+from mi_prt.runtime import mitsuba
+from mi_prt.scene.scene import open_scene
+from mi_prt.transport.direct import sample_direct
+
+mi = mitsuba()
+
+SMALL = dict(floor=rectangle(size=2, bsdf=diffuse(0.6)), box=cube((0.2, 0.4, 0), 0.4), ball=disk((0, 1, 0.1), (0.3, 1.5, 0), 0.6))
+
+
+def precompute(parts=SMALL, directions="cubemap:8", edge_length=0.8, **settings):
+    return mi_prt.precompute(scene(**parts), directions=directions, edge_length=edge_length, **settings)
+
+
+@pytest.fixture(scope="module")
+def asset():
+    return precompute()
+
+
+@pytest.fixture(scope="module")
+def saved(asset, tmp_path_factory):
+    path = tmp_path_factory.mktemp("asset") / "small.prt"
+    asset.save(path)
+    return path
+
+
+# --- PCA -----------------------------------------------------------------------------------------------------------
+
+
+def random_matrix(n, s, rank=None, decay=6.0, seed=0):
+    """(n, s) float32 with a mean far from zero: of a rank with exponentially decaying singular values, or of full rank
+    with values that fall as slowly as 1/k."""
+    rng = np.random.default_rng(seed)
+    values = 1 / np.arange(1, min(n, s) + 1) if rank is None else np.exp(-np.arange(rank) / decay)
+    left, right = rng.standard_normal((n, len(values))), rng.standard_normal((len(values), s))
+    return (left * values @ right + 3 * rng.random(s)).astype(np.float32)
+
+
+def fit(matrix, weights, components, index=None, **seed):
+    index = np.arange(len(matrix)) if index is None else index
+    return fit_pca(lambda rows: matrix[rows].copy(), index, weights, components, **seed)
+
+
+def svd(matrix, weights):
+    """Squared singular values and right vectors of the centred matrix in the √w-weighted space, in float64."""
+    weighted = (matrix - matrix.mean(axis=0, dtype=np.float64)) * np.sqrt(weights)
+    _, values, vectors = np.linalg.svd(weighted, full_matrices=False)
+    return weighted, values**2, vectors
+
+
+EXACT = [(60, 40, None), (40, 60, None), (300, 900, 30), (900, 300, 30)]
+ITERATED = [(2400, 900, 40), (900, 2400, 40), (3000, 800, None)]
+
+
+@pytest.mark.parametrize(("n", "s", "rank"), EXACT + ITERATED)
+def test_components_are_those_of_the_svd(n, s, rank):
+    """The decomposition is unique: exact for small shapes; iterated, captured variance is within 1e-3 of the optimum.
+
+    Shapes choose the path: one side up to EXACT_SIDE, or both beyond it.
+    """
+    components = 16
+    exact = (n, s, rank) in EXACT
+    assert (min(n, s) <= EXACT_SIDE) == exact
+    matrix, weights = random_matrix(n, s, rank), np.random.default_rng(1).random(s) + 0.2
+    basis = fit(matrix, weights, components)
+    weighted, squares, vectors = svd(matrix, weights)
+    optimum = squares[:components] / squares.sum()
+    assert basis.vectors.shape == (components, s)
+    np.testing.assert_allclose(basis.vectors @ basis.vectors.T, np.eye(components), atol=1e-5)
+    assert (np.diff(basis.captured_variance) <= 1e-9).all()
+    assert abs(basis.captured_variance.sum() - optimum.sum()) < (1e-6 if exact else 1e-3)
+    residual = weighted - (weighted @ basis.vectors.T) @ basis.vectors
+    truly = 1 - (residual**2).sum() / squares.sum()
+    assert abs(truly - basis.captured_variance.sum()) < 1e-5
+    if exact:
+        np.testing.assert_allclose(basis.captured_variance, optimum, rtol=1e-4)
+        if rank:  # well separated: each vector is the SVD's, up to sign
+            assert np.abs((basis.vectors * vectors[:components]).sum(axis=1)).min() > 1 - 1e-4
+
+
+def test_encode_and_reconstruct_are_the_projection():
+    """T ≈ mean + c·V/√w with c = (T − mean)√w Vᵀ: the best approximation in the weighted norm, rows left out included."""
+    matrix, weights = random_matrix(200, 80, 25), np.random.default_rng(1).random(80) + 0.2
+    index = np.arange(0, 200, 2)
+    basis = fit(matrix, weights, 10, index)
+    weighted, squares, vectors = svd(matrix[index], weights)
+    mean = matrix[index].mean(axis=0)
+    projection = ((matrix - mean) * np.sqrt(weights) @ vectors[:10].T @ vectors[:10]) / np.sqrt(weights) + mean
+    coefficients = basis.encode(matrix)
+    assert coefficients.shape == (200, 10)
+    assert relative_l2(basis.reconstruct(coefficients), projection) < 1e-5
+
+
+@pytest.mark.parametrize("every", [2, 4])
+def test_rows_that_repeat_in_the_order_of_points_are_not_missed(every):
+    """Meshes order their vertices regularly (quads: every fourth is the same corner). Clamped cosines behind random
+    half-spaces, with each `every`-th row alike: the variance that 48 components capture is within 1e-3 of the optimum."""
+    rng, lattice = np.random.default_rng(0), Cubemap(16)
+    normals, blockers = rng.standard_normal((2, 6000, 3))
+    matrix = np.maximum(normals / np.linalg.norm(normals, axis=1, keepdims=True) @ lattice.vectors.T, 0)
+    matrix *= blockers @ lattice.vectors.T > rng.standard_normal((6000, 1))
+    matrix[::every] = matrix[0]
+    basis = fit(matrix.astype(np.float32), lattice.solid_angles, 48)
+    weighted = (matrix - matrix.mean(axis=0)) * np.sqrt(lattice.solid_angles)
+    squares = np.linalg.eigvalsh(weighted.T @ weighted)[::-1]
+    assert squares[:48].sum() / squares.sum() - basis.captured_variance.sum() < 1e-3
+
+
+@pytest.mark.parametrize(("n", "s", "rank"), [(40, 60, 7), (2400, 900, 7)])
+def test_components_beyond_the_rank_are_left_out(n, s, rank):
+    """A matrix of a rank has that many components and no noise beside them."""
+    matrix, weights = random_matrix(n, s, rank, decay=10.0), np.full(s, 4 * np.pi / s)
+    basis = fit(matrix, weights, 16)
+    assert len(basis.vectors) == rank
+    assert basis.captured_variance.sum() == pytest.approx(1, abs=1e-5)
+    assert relative_l2(basis.reconstruct(basis.encode(matrix)), matrix) < 1e-5
+
+
+@pytest.mark.parametrize(("n", "s"), [(600_000, 60), (100_000, 800)])
+def test_many_points_do_not_lower_the_rank(n, s):
+    """Repeating every row k times multiplies all squared singular values by k and leaves their shares as they were."""
+    table, weights = random_matrix(2000, s), np.ones(s)
+    basis = fit_pca(lambda rows: table[rows % 2000], np.arange(n), weights, 16)
+    _, squares, _ = svd(table, weights)
+    assert len(basis.vectors) == 16
+    assert abs(basis.captured_variance.sum() - squares[:16].sum() / squares.sum()) < 1e-3
+
+
+def test_degenerate_matrices():
+    """All zero, all rows alike, a single row, no components: an empty basis, and the mean is exact."""
+    weights = np.ones(50)
+    for matrix in [np.zeros((9, 50), np.float32), np.full((9, 50), 3.0, np.float32), np.arange(50, dtype=np.float32)[None]]:
+        basis = fit(matrix, weights, 4)
+        assert basis.vectors.shape == (0, 50) and basis.captured_variance.shape == (0,)
+        np.testing.assert_allclose(basis.reconstruct(basis.encode(matrix)), matrix, rtol=1e-6)
+    assert fit(random_matrix(30, 50), weights, 0).vectors.shape == (0, 50)
+
+
+def test_the_same_seed_gives_the_same_basis():
+    """Also where the start is random; another seed gives nearly the same subspace."""
+    matrix, weights = random_matrix(2400, 900, 40), np.ones(900)
+    one, two, other = (fit(matrix, weights, 16, seed=s) for s in (3, 3, 4))
+    np.testing.assert_array_equal(one.vectors, two.vectors)
+    assert np.linalg.norm(one.vectors @ other.vectors.T) ** 2 > 15.99
+
+
+# --- the mean ------------------------------------------------------------------------------------------------------
+
+
+def irradiances(matrix, weights, components, radiance):
+    """Exact mean, the paper's form, and the direct sum Σ w L T."""
+    basis = fit(matrix, weights, components)
+    coefficients = basis.encode(matrix)
+    light, response = basis.project_light(radiance)
+    return basis, coefficients @ light + response, basis.paper_irradiance(coefficients, radiance), matrix @ (weights[:, None] * radiance)
+
+
+def test_the_papers_mean_compensation_agrees_where_the_mean_lies_in_the_span():
+    """Non-negative mixtures of five rows: centred, they still span all five, and with them the mean."""
+    rng = np.random.default_rng(2)
+    matrix = (rng.random((100, 5)) @ rng.random((5, 70))).astype(np.float32)
+    weights, radiance = rng.random(70).astype(np.float32) + 0.1, rng.random((70, 3)).astype(np.float32)
+    _, exact, paper, direct = irradiances(matrix, weights, 5, radiance)
+    assert relative_l2(exact, direct) < 1e-5 and relative_l2(paper, direct) < 1e-5
+
+
+def test_the_papers_mean_compensation_drops_the_mean_outside_of_the_span():
+    """Its error is the same for all points: the response to light of the mean's part outside the span, predicted here."""
+    rng = np.random.default_rng(3)
+    matrix = (rng.standard_normal((100, 5)) @ rng.random((5, 70)) + 5 * rng.random(70)).astype(np.float32)
+    weights, radiance = rng.random(70) + 0.1, rng.random((70, 3)).astype(np.float32)
+    basis, exact, paper, direct = irradiances(matrix, weights, 5, radiance)
+    assert relative_l2(exact, direct) < 1e-5
+    _, _, vectors = svd(matrix, weights)
+    mean = matrix.mean(axis=0, dtype=np.float64) * np.sqrt(weights)
+    outside = mean - vectors[:5].T @ (vectors[:5] @ mean)
+    predicted = outside @ (radiance * np.sqrt(weights)[:, None])
+    assert np.linalg.norm(predicted) > 1
+    np.testing.assert_allclose(exact - paper, np.broadcast_to(predicted, exact.shape), rtol=2e-4)
+
+
+# --- rank and coefficients of scenes -------------------------------------------------------------------------------
+
+
+def maximum_named(caught):
+    message = str(caught.value)
+    assert "\n" not in message
+    return int(message.split()[-1].replace(",", ""))
+
+
+def test_full_rank_reproduces_the_sampled_transport():
+    """With all components nothing is lost: transport, and irradiance under random light, to 1e-5.
+
+    The number of components is found from the refusals, which name the maximum.
+    """
+    with pytest.raises(SettingsError) as caught:
+        precompute(coefficients=100_000)
+    largest = maximum_named(caught)
+    try:
+        full = precompute(coefficients=largest)
+    except SettingsError as error:  # points that see the same make the rank lower than the counts tell
+        largest = int(str(error).split()[-1])
+        full = precompute(coefficients=largest)
+    assert len(full.basis.vectors) == largest == full.settings["coefficients"]
+    lattice = Cubemap(8)
+    sampled = sample_direct(open_scene(scene(**SMALL)), full.points, lattice)
+    rows = np.arange(len(full.points))
+    kept = ~full.buried
+    assert relative_l2(full.transport(rows)[kept], sampled.rows(rows)[kept]) < 1e-5
+    light = np.random.default_rng(0).random((8, 16, 3)).astype(np.float32)
+    expected = sampled.irradiance(cell_radiance(light, lattice), lattice.solid_angles)
+    assert relative_l2(full.irradiance(light)[kept], expected[kept]) < 1e-5
+    assert full.report["captured_variance"] == pytest.approx(1, abs=1e-5)
+
+
+def test_error_falls_with_coefficients():
+    """Nested subspaces: each more component can only lower the error of the transport, down to what was captured."""
+    errors = []
+    for coefficients in (0, 4, 16, 48):
+        fitted = precompute(coefficients=coefficients)
+        rows = np.flatnonzero(~fitted.buried)
+        sampled = sample_direct(open_scene(scene(**SMALL)), fitted.points, Cubemap(8)).rows(rows)
+        weighted = (fitted.transport(rows) - sampled) * np.sqrt(Cubemap(8).solid_angles)
+        total = (sampled - sampled.mean(axis=0)) * np.sqrt(Cubemap(8).solid_angles)
+        errors.append((weighted**2).sum() / (total**2).sum())
+        assert errors[-1] == pytest.approx(1 - fitted.report["captured_variance"], abs=1e-4)
+    assert errors == sorted(errors, reverse=True) and errors[0] == pytest.approx(1, abs=1e-5)
+
+
+def test_a_scene_of_rank_zero():
+    """A single plane has one row of transport: the default takes no component and loses nothing; more are refused."""
+    flat = precompute(dict(plane=rectangle()))
+    assert flat.coefficients.shape == (len(flat.points), 0) and flat.settings["coefficients"] == 0
+    np.testing.assert_allclose(flat.irradiance(uniform_sky()), np.pi, rtol=0.01)
+    with pytest.raises(SettingsError) as caught:
+        precompute(dict(plane=rectangle()), coefficients=5)
+    assert maximum_named(caught) == 0
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [dict(coefficients=-1), dict(rays_per_direction=0), dict(rays_per_direction=65), dict(seed=-1), dict(directions="cubemap:0"),
+     dict(coefficients="many"), dict(coefficients=2.5), dict(rays_per_direction=1.5), dict(seed="x"), dict(rays_per_direction=None)],
+    ids=str,
+)  # fmt: skip
+def test_bad_settings(bad):
+    """Also of a wrong type: the caller gets a SettingsError before any work starts."""
+    with pytest.raises(SettingsError) as caught:
+        precompute(**bad)
+    assert "\n" not in str(caught.value)
+
+
+# --- the file ------------------------------------------------------------------------------------------------------
+
+
+def test_round_trip(asset, saved):
+    """What is loaded is what was saved, bit for bit."""
+    loaded = mi_prt.load(saved)
+    for name in ("positions", "normals", "geometric_normals", "albedo", "areas", "uv", "surface"):
+        np.testing.assert_array_equal(getattr(loaded.points, name), getattr(asset.points, name))
+    for name in ("levels", "offsets", "nodes", "back"):
+        np.testing.assert_array_equal(getattr(loaded.points.patches, name), getattr(asset.points.patches, name))
+    for name in ("vectors", "mean", "sqrt_weights", "captured_variance"):
+        np.testing.assert_array_equal(getattr(loaded.basis, name), getattr(asset.basis, name))
+    np.testing.assert_array_equal(loaded.coefficients, asset.coefficients)
+    np.testing.assert_array_equal(loaded.buried, asset.buried)
+    for name in ("scene", "settings", "versions", "report"):
+        assert getattr(loaded, name) == json.loads(json.dumps(getattr(asset, name)))
+    assert loaded.points.report == asset.points.report and list(loaded.points.surfaces) == list(asset.points.surfaces)
+    assert loaded.directions == asset.directions
+    light = np.random.default_rng(0).random((8, 16, 3))
+    np.testing.assert_array_equal(loaded.relight(light), asset.relight(light))
+    assert loaded.path == saved and saved.stat().st_mode & 0o444 == 0o444 & ~umask()
+
+
+def umask():
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def test_saving_what_was_loaded_gives_the_same_file(saved, tmp_path):
+    mi_prt.load(saved).save(tmp_path / "again.prt")
+    assert (tmp_path / "again.prt").read_bytes() == saved.read_bytes()
+
+
+def test_the_file_is_enough_for_h5py_and_numpy(asset, saved):
+    """As docs/asset-format.md says: E = max(0, c·(V (L√w)) + Σ w L mean), from the file's datasets alone."""
+    with h5py.File(saved) as file:
+        w = file["directions/solid_angles"][()]
+        radiance = np.random.default_rng(1).random((len(w), 3))  # of the cells
+        light = radiance * np.sqrt(w)[:, None]
+        mean = (file["basis/mean"][()] * np.sqrt(w)) @ light
+        irradiance = np.maximum(file["coefficients"][()] @ (file["basis/vectors"][()] @ light) + mean, 0)
+        vectors = file["directions/vectors"][()]
+        assert {"units", "format_version", "scene", "settings", "versions"} <= set(file.attrs)
+    expected = asset.irradiance_from(*asset.basis.project_light(radiance.astype(np.float32)))
+    assert relative_l2(irradiance, expected) < 1e-5
+    assert w.sum() == pytest.approx(4 * np.pi) and np.allclose(np.linalg.norm(vectors, axis=1), 1, atol=1e-5)
+
+
+def test_the_same_seed_gives_the_same_file_within_a_process(saved, tmp_path):
+    """Nothing of time, addresses or thread order gets into the file."""
+    precompute().save(tmp_path / "again.prt")
+    assert (tmp_path / "again.prt").read_bytes() == saved.read_bytes()
+
+
+PROGRAM = """
+import sys, mi_prt
+parts = {"type": "scene", "ball": {"type": "sphere", "center": [0, 1, 0]}, "box": {"type": "cube"}, "extra": {"type": "disk"}}
+mi_prt.precompute(parts, directions="cubemap:8", edge_length=0.5).save(sys.argv[1])
+"""
+
+
+def test_the_same_seed_gives_the_same_file_in_two_processes(tmp_path):
+    """Another hash seed and addresses; unnamed shapes, whose made-up ids hold an address."""
+    running = [
+        subprocess.Popen([sys.executable, "-c", PROGRAM, str(tmp_path / f"{i}.prt")], env=os.environ | {"PYTHONHASHSEED": str(i)})
+        for i in (1, 2)
+    ]
+    assert [process.wait(120) for process in running] == [0, 0]
+    one, two = (hashlib.sha256((tmp_path / f"{i}.prt").read_bytes()).hexdigest() for i in (1, 2))
+    assert one == two
+
+
+@pytest.mark.parametrize("share", [0.0, 1e-4, 0.01, 0.1, 0.37, 0.5, 0.9, 0.99, 1 - 1e-6])
+def test_a_truncated_file_is_refused(saved, tmp_path, share):
+    whole = saved.read_bytes()
+    (tmp_path / "cut.prt").write_bytes(whole[: int(share * len(whole))])
+    with pytest.raises(AssetError, match="cut.prt") as caught:
+        mi_prt.load(tmp_path / "cut.prt")
+    assert "\n" not in str(caught.value)
+
+
+def test_damaged_bytes_never_end_in_another_error(saved, tmp_path):
+    """Three random bytes changed, 60 times, mostly in the head where the structure is: loads, or AssetError."""
+    whole, rng = saved.read_bytes(), np.random.default_rng(0)
+    for i in range(60):
+        damaged = bytearray(whole)
+        for place in rng.integers(0, len(whole) if i % 3 == 0 else 3000, 3):
+            damaged[place] = rng.integers(256)
+        (tmp_path / "damaged.prt").write_bytes(damaged)
+        try:
+            mi_prt.load(tmp_path / "damaged.prt")
+        except AssetError:
+            pass
+
+
+def changed(saved, path, change):
+    path.write_bytes(saved.read_bytes())
+    with h5py.File(path, "r+") as file:
+        change(file)
+    return path
+
+
+def test_foreign_and_incomplete_files_are_refused(saved, tmp_path):
+    """Missing, a folder, text, another HDF5 file, another version, not finished, a field missing, metadata that is no JSON."""
+    (tmp_path / "text.prt").write_text("hello\n" * 100)
+    with h5py.File(tmp_path / "foreign.prt", "w") as file:
+        file["x"] = [1, 2]
+    (tmp_path / "folder.prt").mkdir()
+    cases = {
+        tmp_path / "missing.prt": "does not exist",
+        tmp_path / "folder.prt": "folder.prt",
+        tmp_path / "text.prt": "text.prt",
+        tmp_path / "foreign.prt": "no mi_prt asset",
+        changed(saved, tmp_path / "v.prt", lambda f: f.attrs.__setitem__("format_version", 99)): "version 99",
+        changed(saved, tmp_path / "v0.prt", lambda f: f.attrs.__delitem__("format_version")): "v0.prt",
+        changed(saved, tmp_path / "i.prt", lambda f: f.attrs.__delitem__("complete")): "incomplete",
+        changed(saved, tmp_path / "f.prt", lambda f: f.__delitem__("basis/mean")): "f.prt",
+        changed(saved, tmp_path / "j.prt", lambda f: f.attrs.__setitem__("report", "{no json")): "j.prt",
+        changed(saved, tmp_path / "n.prt", lambda f: f.attrs.__setitem__("scene", 5)): "n.prt",
+        changed(saved, tmp_path / "d.prt", lambda f: f["directions"].attrs.__setitem__("lattice", "sphere:9")): "d.prt",
+    }
+    for path, message in cases.items():
+        with pytest.raises(AssetError, match=message) as caught:
+            mi_prt.load(path)
+        assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["coefficients", "basis/vectors", "points/positions", "points/buried", "basis/sqrt_weights", "points/patches/nodes"])
+def test_arrays_that_do_not_fit_together_are_refused(saved, tmp_path, name):
+    """A file with one array shorter than the others would fail later, or worse, not fail."""
+
+    def shorten(file):
+        values = file[name][()]
+        del file[name]
+        file[name] = values[:-1]
+
+    with pytest.raises(AssetError):
+        mi_prt.load(changed(saved, tmp_path / "odd.prt", shorten))
+
+
+# --- saving --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyboardInterrupt(), RuntimeError("HDF5 fails")], ids=lambda e: type(e).__name__)
+def test_a_failing_write_leaves_the_old_file(asset, tmp_path, monkeypatch, error):
+    """All or nothing: what was there stays, and no temporary file is left; a full disk is a SettingsError."""
+    path = tmp_path / "old.prt"
+    path.write_bytes(b"old")
+
+    def fail(self, temporary):
+        with open(temporary, "wb") as file:
+            file.write(b"half")
+        raise error
+
+    monkeypatch.setattr(Asset, "_write", fail)
+    with pytest.raises(SettingsError if isinstance(error, OSError) else type(error)):
+        asset.save(path)
+    assert path.read_bytes() == b"old" and os.listdir(tmp_path) == ["old.prt"]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="a limit on file sizes stands for a full disk")
+def test_a_full_disk_is_an_error_and_no_crash(saved, tmp_path):
+    """Writes that fail half way, as on a full disk: SettingsError, the old file stays, no temporary file."""
+    code = """
+import resource, signal, sys, mi_prt
+asset = mi_prt.load(sys.argv[1])
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
+try:
+    asset.save(sys.argv[2])
+except mi_prt.SettingsError:
+    print("refused")
+"""
+    (tmp_path / "old.prt").write_bytes(b"old")
+    ran = subprocess.run([sys.executable, "-c", code, str(saved), str(tmp_path / "old.prt")], capture_output=True, text=True, timeout=120)
+    assert (tmp_path / "old.prt").read_bytes() == b"old"
+    assert (ran.returncode, ran.stdout.strip()) == (0, "refused"), ran.stderr[-2000:]
+    assert os.listdir(tmp_path) == ["old.prt"]
+
+
+def test_paths_that_cannot_be_written(asset, tmp_path):
+    """A folder, a folder that is missing, a file in the place of a folder, a name longer than file systems take."""
+    (tmp_path / "file").write_text("x")
+    (tmp_path / "folder").mkdir()
+    for path in [tmp_path / "folder", tmp_path / "none" / "a.prt", tmp_path / "file" / "a.prt", tmp_path / ("x" * 300 + ".prt"), tmp_path / ("y" * 250)]:
+        with pytest.raises(SettingsError) as caught:
+            asset.save(path)
+        assert "\n" not in str(caught.value)
+    assert sorted(os.listdir(tmp_path)) == ["file", "folder"]
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may write anywhere")
+def test_a_folder_without_permission(asset, tmp_path):
+    tmp_path.chmod(0o500)
+    try:
+        with pytest.raises(SettingsError, match="permission"):
+            asset.save(tmp_path / "a.prt")
+    finally:
+        tmp_path.chmod(0o700)
+
+
+def test_saving_over_an_asset_and_to_a_relative_path(asset, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    asset.save("a.prt")
+    asset.save("a.prt")
+    assert mi_prt.load("a.prt").path == tmp_path / "a.prt" and os.listdir(tmp_path) == ["a.prt"]
+
+
+# --- kernels -------------------------------------------------------------------------------------------------------
+
+
+def test_blocks_share_their_kernels(monkeypatch):
+    """What changes from block to block is opaque to the compiler: many small blocks need no kernel that one did not.
+
+    And they give the same bits: rays do not know their block.
+    """
+    parts = SMALL | {"inner": sphere((0.2, 0.4, 0), 0.1)}  # inside the box: dark, so that the search for buried points runs
+    whole, _ = measure(scene(**parts), directions="cubemap:8", edge_length=0.4)
+    monkeypatch.setattr(mi_prt.transport.direct, "LANES", 384 * 7)
+    blocked, cost = measure(scene(**parts), directions="cubemap:8", edge_length=0.4)
+    assert len(whole.points) > 10 * 7 and whole.buried.sum() > 7
+    assert cost["kernels"] == 0
+    np.testing.assert_array_equal(blocked.buried, whole.buried)
+    np.testing.assert_array_equal(blocked.coefficients, whole.coefficients)
+    assert blocked.report == whole.report
+
+
+def test_rays_are_counted(asset):
+    """Rays are those above the horizon: of each point those cells whose centre has n·ω > 0."""
+    above = (asset.points.normals @ Cubemap(8).vectors.T > 0).sum()
+    assert abs(asset.report["rays"] - above) <= 2e-3 * above
+
+
+def test_radiance_of_the_default_basis_is_close(asset):
+    """48 components of this scene: within 3 % of the sampled transport under a smooth sky, without bias."""
+    lattice = Cubemap(8)
+    sampled = sample_direct(open_scene(scene(**SMALL)), asset.points, lattice)
+    expected = sampled.irradiance(np.ones((len(lattice), 3), np.float32), lattice.solid_angles)
+    assert relative_l2(asset.irradiance(uniform_sky()), expected) < 0.03
+    assert abs(bias(asset.irradiance(uniform_sky()), expected)) < 0.01
