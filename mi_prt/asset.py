@@ -4,8 +4,6 @@ The file is read with NumPy and h5py alone; docs/asset-format.md describes it fi
 """
 
 import json
-import os
-import tempfile
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -14,7 +12,8 @@ import numpy as np
 
 from .basis.pca import PCA
 from .directions import parse_directions
-from .errors import AssetError, SettingsError
+from .errors import AssetError
+from .files import replacing
 from .lighting.cells import cell_radiance
 from .lighting.lattice import on_lattice
 from .points.lattice import Patches
@@ -136,17 +135,8 @@ class Asset:
             If the path cannot be written.
         """
         path = Path(path)
-        check_writable(path)
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
-        os.close(handle)
-        try:
+        with replacing(path) as temporary:
             self._write(temporary)
-            os.chmod(temporary, 0o666 & ~_umask())
-            os.replace(temporary, path)
-        except OSError as error:
-            raise SettingsError(f"'{path}' cannot be written: {error}") from None
-        finally:
-            Path(temporary).unlink(missing_ok=True)
         object.__setattr__(self, "path", path.absolute())
 
     def _write(self, path):
@@ -232,21 +222,3 @@ def _read(file, path):
         path=path.absolute(),
         **texts,
     )
-
-
-def check_writable(path):
-    """Raise SettingsError unless a file can be created at `path`."""
-    path = Path(path)
-    folder = path.absolute().parent
-    if path.is_dir():
-        raise SettingsError(f"output '{path}' is a folder: give a file name")
-    if not folder.is_dir():
-        raise SettingsError(f"output folder '{folder}' does not exist: create it first")
-    if not os.access(folder, os.W_OK) or (path.exists() and not os.access(path, os.W_OK)):
-        raise SettingsError(f"output '{path}' cannot be written: permission denied")
-
-
-def _umask():
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask

@@ -111,7 +111,7 @@ def precompute(
     as_json: Json = False,
 ):
     """Precompute a scene's transport into one file."""
-    from .asset import check_writable
+    from .files import check_writable
     from .precompute import measure
 
     check_writable(output)

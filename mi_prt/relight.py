@@ -3,14 +3,14 @@
 import time
 from pathlib import Path
 
-from .asset import check_writable
 from .errors import SettingsError
+from .files import check_writable
 from .lighting.cells import cell_radiance
 from .lighting.light import as_light
 from .lighting.scene_light import lit_scene, turned_light
 from .provenance import open_scene_of
 from .render.display import exposure
-from .render.export import write_displayed, write_image, write_npz, write_ply
+from .render.export import write_image, write_npz, write_ply
 from .render.image import pick_sensor, render_image, resized
 from .scene.scene import Scene
 
@@ -36,7 +36,7 @@ def relight_to_file(asset, output, light=None, rotate=None, scene=None, sensor=0
     sensor : int
     size : (width, height), optional
     renderer : 'mitsuba' or 'raster'
-        The integrator `prt`, or pyrender; the raster image is 8-bit, so .png only.
+        The integrator `prt`, or pyrender.
     spp : int
         Samples per pixel of the integrator.
 
@@ -55,8 +55,6 @@ def relight_to_file(asset, output, light=None, rotate=None, scene=None, sensor=0
         raise SettingsError(f"output '{output}' must end in {', '.join(IMAGES + MESHES)}")
     if renderer not in RENDERERS:
         raise SettingsError(f"renderer '{renderer}' is not known: use {' or '.join(RENDERERS)}")
-    if renderer == "raster" and suffix != ".png":
-        raise SettingsError(f"the raster renderer makes 8-bit images: use a .png output instead of '{output.name}'")
     check_writable(output)
 
     needs_scene = suffix in IMAGES or light is None
@@ -66,7 +64,7 @@ def relight_to_file(asset, output, light=None, rotate=None, scene=None, sensor=0
     else:
         shown, cells_light = turned_light(opened, light, rotate)
     if renderer == "raster":
-        from .render.raster import render_raster  # opens OpenGL: only where it is asked for
+        from .render.raster import RasterScene  # opens OpenGL: only where it is asked for
 
     clock = [time.perf_counter()]
     projected = asset.basis.project_light(cell_radiance(cells_light, asset.directions))
@@ -83,9 +81,11 @@ def relight_to_file(asset, output, light=None, rotate=None, scene=None, sensor=0
         lit = Scene(lit_scene(opened.mi_scene, shown), opened.source)
         with resized(pick_sensor(lit.mi_scene, sensor), size) as camera:
             if renderer == "raster":
-                write_displayed(output, render_raster(asset, lit, irradiance, camera, factor))
+                with RasterScene(asset, lit, camera) as raster:
+                    image = raster.radiance(irradiance)
             else:
-                write_image(output, render_image(asset, lit.mi_scene, camera, spp), factor)
+                image = render_image(asset, lit.mi_scene, camera, spp)
+        write_image(output, image, factor)
     clock.append(time.perf_counter())
     stages = zip(("project", "relight", "render"), clock, clock[1:])
     return {"points": len(asset.points), "seconds": {name: round(b - a, 5) for name, a, b in stages}}

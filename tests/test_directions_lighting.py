@@ -67,6 +67,16 @@ def test_cells_partition_the_sphere(resolution):
     np.testing.assert_array_equal(lattice.cells(lattice.vectors), np.arange(len(lattice)))
 
 
+@pytest.mark.parametrize("resolution", [1, 2, 7])
+@pytest.mark.parametrize("rays", [1, 6])
+def test_the_lattice_is_symmetric_about_the_origin(resolution, rays):
+    """Cell j + s/2 is the antipode of cell j, ray by ray: tracing only one of each pair relies on it."""
+    vectors, fractions = Cubemap(resolution).subdivided(rays)
+    half = len(vectors) // 2
+    np.testing.assert_allclose(vectors[half:], -vectors[:half], atol=1e-7)
+    np.testing.assert_allclose(fractions[half:], fractions[:half], rtol=1e-6)
+
+
 @pytest.mark.parametrize("resolution", [1, 3, 8])
 def test_solid_angles_are_the_share_of_random_directions(resolution):
     """Uniform directions fall into cells in proportion to their solid angles: χ² test, 1e-6 false positives, fixed seed."""
@@ -127,7 +137,7 @@ def test_subdivision(rays):
         aa, bb = a[1][None, :], a[0][:, None]
         density = widths[1] * widths[0] / (1 + aa**2 + bb**2) ** 1.5
         mean = np.array([(aa * density / np.sqrt(1 + aa**2 + bb**2)).sum(), (bb * density / np.sqrt(1 + aa**2 + bb**2)).sum()])
-        cell = 4 * 16 + 1  # face +z (frame x, y), row 0, column 1
+        (cell,) = lattice.cells(np.array([[np.tan(np.pi / 4 * -0.25), np.tan(np.pi / 4 * -0.75), 1.0]]))
         ours = (fractions[cell, :, None] * vectors[cell]).sum(axis=0)[:2] * lattice.solid_angles[cell]
         np.testing.assert_allclose(ours, mean, rtol=1e-3)
 

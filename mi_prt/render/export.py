@@ -1,14 +1,11 @@
 """Relit points and images as files. Each is written all or nothing: until it is whole, a file of that name stays."""
 
-import os
-import tempfile
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 
-from ..asset import check_writable
 from ..errors import SettingsError
+from ..files import replacing
 from ..runtime import mitsuba
 from .display import display, exposure
 
@@ -61,7 +58,7 @@ def write_ply(path, asset, radiance):
         "property list uchar int vertex_indices",
         "end_header",
     ]
-    with _replacing(path) as temporary, open(temporary, "wb") as file:
+    with replacing(path) as temporary, open(temporary, "wb") as file:
         file.write("\n".join(header).encode() + b"\n")
         vertices.tofile(file)
         faces.tofile(file)
@@ -85,7 +82,7 @@ def write_npz(path, asset, radiance, irradiance):
         If the path cannot be written.
     """
     points = asset.points
-    with _replacing(path) as temporary, open(temporary, "wb") as file:
+    with replacing(path) as temporary, open(temporary, "wb") as file:
         np.savez(
             file,
             positions=points.positions,
@@ -119,7 +116,7 @@ def write_image(path, radiance, factor=1.0):
     elif suffix == ".exr":
         mi = mitsuba()
         bitmap = mi.Bitmap(np.ascontiguousarray(radiance, dtype=np.float32))
-        with _replacing(path) as temporary:
+        with replacing(path) as temporary:
             bitmap.write(temporary, mi.Bitmap.FileFormat.OpenEXR)
     else:
         raise SettingsError(f"image '{path}' must end in .exr or .png")
@@ -137,28 +134,10 @@ def write_displayed(path, displayed):
 
     if Path(path).suffix.lower() != ".png":
         raise SettingsError(f"displayed image '{path}' must end in .png")
-    with _replacing(path) as temporary:
+    with replacing(path) as temporary:
         Image.fromarray(to_8bit(displayed)).save(temporary, format="PNG")
 
 
 def to_8bit(displayed):
     """Displayed values 0…1 as uint8, rounded."""
     return np.rint(np.asarray(displayed) * 255).astype(np.uint8)
-
-
-@contextmanager
-def _replacing(path):
-    """Name of a new file in the same folder, which takes the place of `path` once the block has ended without error."""
-    path = Path(path)
-    check_writable(path)
-    handle, temporary = tempfile.mkstemp(dir=path.absolute().parent, prefix=f".{path.name}.", suffix=".part")
-    os.close(handle)
-    try:
-        yield temporary
-        os.umask(mask := os.umask(0))
-        os.chmod(temporary, 0o666 & ~mask)
-        os.replace(temporary, path)
-    except (OSError, RuntimeError) as error:  # Mitsuba raises RuntimeError
-        raise SettingsError(f"'{path}' cannot be written: {' '.join(str(error).split())}") from None
-    finally:
-        Path(temporary).unlink(missing_ok=True)

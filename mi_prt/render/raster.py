@@ -12,24 +12,17 @@ Importing this module opens OpenGL.
 
 import warnings
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 
 import numpy as np
 
-from ..errors import RuntimeSetupError, SceneError, SettingsError
+from ..errors import SceneError, SettingsError
 from ..points.lattice import lattice_nodes, lattice_triangles
-from ..runtime import mitsuba, raster_install_command, raster_platform
-from ..runtime import pyrender as load_pyrender
+from ..runtime import mitsuba
 from ..scene.traversal import transform_of
+from .canvas import draw, drawing, make_current, new_primitive, open_canvas
 from .display import display
 
-pyrender = load_pyrender()  # chooses the OpenGL platform, before OpenGL is imported
-from OpenGL import GL  # noqa: E402
-from pyrender.renderer import Renderer  # noqa: E402
-from pyrender.shader_program import ShaderProgramCache  # noqa: E402
-
-SHADERS = Path(__file__).parent / "shaders"
 SENSORS = {"PerspectiveCamera": "perspective", "ThinLensCamera": "thinlens", "OrthographicCamera": "orthographic"}
 MIN_TEXELS, MAX_TEXELS = 512, 4096  # along a side of a baked texture
 PROCEDURAL_TEXELS = 256  # along a period of a texture that is no bitmap
@@ -100,9 +93,9 @@ class RasterScene:
         self._reflection, self._emission, albedo = _shading(scene, asset.points)
         self._parts = _parts(scene, asset.points)
         width, height = self._view.size
-        self._canvas = _open_canvas(width * samples, height * samples)
-        self._primitives = [_primitive(part, asset.points, albedo) for part in self._parts]
-        self._drawing = _drawing(self._primitives, self._view)
+        self._canvas = open_canvas(width * samples, height * samples)
+        self._primitives = [new_primitive(part, asset.points, albedo) for part in self._parts]
+        self._drawing = drawing(self._primitives, self._view)
         self._sky = None
 
     def draw(self, irradiance, factor, background=None):
@@ -126,20 +119,20 @@ class RasterScene:
         if np.shape(irradiance) != self._emission.shape:
             raise SettingsError(f"irradiance must be of shape {self._emission.shape}, got {np.shape(irradiance)}")
         light = np.hstack([self._weight * (self._reflection * irradiance + self._emission), self._weight])
-        _make_current()
+        make_current()
         for part, primitive in zip(self._parts, self._primitives):
             primitive.color_0 = light[part.points]
             if primitive._in_context():
                 primitive._remove_from_context()
                 primitive._add_to_context()
-        drawn = self._canvas.render(self._drawing, pyrender.RenderFlags.OFFSCREEN)
+        drawn = draw(self._canvas, self._drawing)
         self._add_background(drawn, (background or self._scene.mi_scene).environment())
         k = self._samples
         return sum(drawn[i::k, j::k, :3] for i in range(k) for j in range(k)) / np.float32(k * k)
 
     def close(self):
         """Free what OpenGL holds."""
-        _make_current()
+        make_current()
         self._canvas.delete()
 
     def __enter__(self):
@@ -376,118 +369,3 @@ def _interaction(surface, uv, side=1):
 def _rgb(colour, count):
     """A Mitsuba colour as (count, 3)."""
     return np.broadcast_to(np.array(mitsuba().Color3f(colour)).reshape(3, -1).T, (count, 3))
-
-
-# --- OpenGL, by way of pyrender ------------------------------------------------------------------------------------
-
-
-class _Canvas(Renderer):
-    """pyrender's renderer with the shaders of this program and one float32 image, (h, w, 4), without multisampling."""
-
-    def __init__(self, width, height):
-        super().__init__(width, height)
-        self._program_cache = ShaderProgramCache(str(SHADERS))
-
-    def _bind_lighting(self, scene, program, node, flags):
-        view = scene.main_camera_node.camera.view
-        program.set_uniform("eye", view.eye)
-        program.set_uniform("depth", view.depth)
-
-    def _configure_main_framebuffer(self):
-        if self._main_fb_ms is None:  # pyrender's name for the framebuffer that it draws to
-            self._main_fb_ms, self._buffers = GL.glGenFramebuffers(1), GL.glGenRenderbuffers(2)
-            GL.glBindFramebuffer(GL.GL_FRAMEBUFFER, self._main_fb_ms)
-            self._attach(self._buffers[0], GL.GL_RGBA32F, GL.GL_COLOR_ATTACHMENT0)
-            self._attach(self._buffers[1], GL.GL_DEPTH_COMPONENT32F, GL.GL_DEPTH_ATTACHMENT)
-
-    def _attach(self, buffer, pixels, place):
-        GL.glBindRenderbuffer(GL.GL_RENDERBUFFER, buffer)
-        GL.glRenderbufferStorage(GL.GL_RENDERBUFFER, pixels, self.viewport_width, self.viewport_height)
-        GL.glFramebufferRenderbuffer(GL.GL_FRAMEBUFFER, place, GL.GL_RENDERBUFFER, buffer)
-
-    def _delete_main_framebuffer(self):
-        if self._main_fb_ms is not None:
-            GL.glDeleteFramebuffers(1, [self._main_fb_ms])
-            GL.glDeleteRenderbuffers(2, self._buffers)
-            self._main_fb_ms = None
-
-    def _read_main_framebuffer(self, scene, flags):
-        width, height = self.viewport_width, self.viewport_height
-        GL.glBindFramebuffer(GL.GL_READ_FRAMEBUFFER, self._main_fb_ms)
-        return GL.glReadPixels(0, 0, width, height, GL.GL_RGBA, GL.GL_FLOAT).reshape(height, width, 4)[::-1]
-
-
-class _Camera(pyrender.Camera):
-    def __init__(self, view):
-        super().__init__()
-        self.view = view
-
-    def get_projection_matrix(self, width=None, height=None):
-        return self.view.to_clip
-
-
-class _Albedo(pyrender.Texture):
-    """A texture in half precision, linear; pyrender's own have 8 bits, too few for dark albedo."""
-
-    def __init__(self, texels):
-        clamp = pyrender.GLTF.CLAMP_TO_EDGE
-        sampler = pyrender.Sampler(None, GL.GL_LINEAR, GL.GL_LINEAR_MIPMAP_LINEAR, clamp, clamp)
-        super().__init__(sampler=sampler, source_channels="RGB", width=texels.shape[1], height=texels.shape[0])
-        self._texels = texels
-
-    def _add_to_context(self):
-        super()._add_to_context()
-        self._bind()
-        texels = self._texels.astype(np.float32)
-        GL.glTexImage2D(GL.GL_TEXTURE_2D, 0, GL.GL_RGB16F, self.width, self.height, 0, GL.GL_RGB, GL.GL_FLOAT, texels)
-        GL.glGenerateMipmap(GL.GL_TEXTURE_2D)
-        self._unbind()
-
-
-def _primitive(part, points, albedo):
-    """A part as pyrender draws it; its light is set later."""
-    texture = None if part.texture is None else _Albedo(part.texture)
-    return pyrender.Primitive(
-        points.positions[part.points],
-        normals=points.normals[part.points],
-        tangents=albedo[part.points],
-        texcoord_0=part.uv,
-        indices=part.triangles,
-        material=pyrender.MetallicRoughnessMaterial(baseColorTexture=texture, doubleSided=True),
-    )
-
-
-def _drawing(primitives, view):
-    """pyrender's scene of some primitives, over nothing."""
-    drawing = pyrender.Scene(bg_color=np.zeros(4))
-    drawing.add(pyrender.Mesh(primitives))
-    drawing.add(_Camera(view))
-    return drawing
-
-
-@cache
-def _context():
-    """OpenGL's context: one for the process, because EGL ends all when it closes one."""
-    platform = raster_platform()
-    try:
-        return pyrender.OffscreenRenderer(1, 1)
-    except Exception as error:  # each platform raises errors of its own kind
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise RuntimeSetupError(
-            f"OpenGL cannot be opened through {platform} ({reason}); install what is missing with "
-            f"`{raster_install_command()}`"
-        ) from error
-
-
-def _make_current():
-    _context()._platform.make_current()
-
-
-def _open_canvas(width, height):
-    _make_current()
-    limit = GL.glGetIntegerv(GL.GL_MAX_RENDERBUFFER_SIZE)
-    if max(width, height) > limit:
-        raise SettingsError(
-            f"a raster image of {width}x{height} samples is above OpenGL's limit of {limit} a side: make it smaller"
-        )
-    return _Canvas(width, height)
