@@ -46,7 +46,7 @@ def sampling(scene, points, directions, repeat):
     size = direct.LANES // tracer.lanes_per_point
     starts = [int(first) for first in np.linspace(0, len(points) - size, 8)]
     blocks = [(first, size) for first in starts]
-    rays = [tracer.rays(*block)[0] for block in blocks]
+    rays = [tracer.rays(*block) for block in blocks]
     dr.eval(rays)
     collections = [], []
     for _ in range(repeat + 1):

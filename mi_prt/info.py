@@ -52,7 +52,7 @@ def describe(source, parameters=None, **settings):
     transport = probe["rays"] * n / probe["rate"]
     basis = probe["pass"] * n * BASIS_PASSES
     stored = n * (4 * coefficients + 60) + s * 4 * (coefficients + 6) + 4 * len(points.patches.nodes)
-    working = n * s * rays // 8 + LANES * 30 + 40 * s * (coefficients + 16) + stored
+    working = n * s * rays // 16 + LANES * 30 + 40 * s * (coefficients + 16) + stored
     return {
         "requires": _requirements(scene, points, int(probe["rays"] * n)),
         "settings": _reasons(settings, points, directions, coefficients),

@@ -70,7 +70,6 @@ def test_files_that_are_no_scene(tmp_path):
         {"type": "scene", "a": {"type": "sphere", "radius": "wide"}},
         {"type": "scene", "a": {"type": "sphere", "unknown": 1.0}},
         {"type": "scene", "a": {"type": "sphere", "bsdf": {"type": "ref", "id": "none"}}},
-        {"a": {"type": "sphere"}},
         {"type": 5},
     ],
     ids=str,
@@ -85,15 +84,16 @@ def test_things_that_are_no_scene(source):
     refused(source)
 
 
-def test_a_scene_of_shapes_that_cannot_be_sampled():
+def curve(path):
+    """A shape that the points do not cover."""
+    path.write_text("".join(f"0 {i} 0 0.1\n" for i in range(5)))
+    return {"type": "bsplinecurve", "filename": str(path)}
+
+
+def test_a_scene_of_shapes_that_cannot_be_sampled(tmp_path):
     """They cast shadows, but nothing is left to light; the message names their kind and what to use."""
-    parts = scene(a={"type": "bsplinecurve", "control_point_count": 4, "control_points": [[0.0, i, 0, 0.1] for i in range(4)]})
-    try:
-        open_scene(parts)
-    except SceneError:
-        pytest.skip("this Mitsuba takes no control points in a dict")
-    with pytest.raises(SceneError, match="BSpline"):
-        mi_prt.precompute(parts, directions="cubemap:4")
+    with pytest.raises(SceneError, match="BSplineCurve"):
+        mi_prt.precompute(scene(hair=curve(tmp_path / "curve.txt")), directions="cubemap:4")
 
 
 # --- parameters ----------------------------------------------------------------------------------------------------
@@ -216,15 +216,14 @@ def test_local_lights_are_listed_and_distant_ones_are_not():
     assert {s["name"] for s in asset.points.surfaces} == {"floor", "lamp"}
 
 
-def test_shapes_without_points_are_named():
-    """A curve casts shadows but is not sampled: it is named among what is left out."""
-    curve = {"type": "sdfgrid", "grid": mi.TensorXf(np.linspace(-1, 1, 8).reshape(2, 2, 2, 1).astype(np.float32))}
-    try:
-        opened = open_scene(scene(floor=rectangle(position=(0, -1, 0)), field=curve))
-    except SceneError:
-        pytest.skip("no such shape in this Mitsuba")
-    asset = mi_prt.precompute(opened, directions="cubemap:4", edge_length=1.0)
-    assert ["field"] in [e["shapes"] for e in asset.scene["left_out"]]
+def test_shapes_without_points_are_named_and_cast_shadows(tmp_path):
+    """A curve is not sampled: it is named among what is left out, and it takes light from the floor."""
+    parts = dict(floor=rectangle(position=(0, -0.2, 0)))
+    plain = mi_prt.precompute(scene(**parts), directions="cubemap:16", edge_length=0.5)
+    asset = mi_prt.precompute(scene(**parts, hair=curve(tmp_path / "curve.txt")), directions="cubemap:16", edge_length=0.5)
+    assert ["hair"] in [e["shapes"] for e in asset.scene["left_out"]]
+    assert len(asset.points) == len(plain.points)
+    assert asset.irradiance(uniform_sky()).min() < 0.98 * plain.irradiance(uniform_sky()).min()
 
 
 # --- the modelled scene --------------------------------------------------------------------------------------------

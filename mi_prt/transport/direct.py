@@ -15,19 +15,19 @@ BURIED_RAYS = 64
 class DirectTransport:
     """The sampled transport matrix, one bit for every ray.
 
-    T is visibility times a cosine that normals and directions give back, so bits are all that must be stored: 32
-    times less than float32.
+    T is visibility times a cosine that normals and directions give back, so bits are all that must be stored; and of two
+    opposite directions one lies below the horizon, so one bit serves both. That is 64 times less than float32.
 
     Parameters
     ----------
     normals : (n, 3) float32
-    vectors : (2, r, s/2, 3) float32
-        The r directions sampled in each cell, scaled by the share of the cell's solid angle that each stands for; the
-        second half of the cells are the antipodes of the first.
-    bits : (n, ceil(s·r/8)) uint8
-        Visibility, packed in the order of `vectors`; a ray below the horizon counts as blocked.
+    vectors : (r, s/2, 3) float32
+        The r directions sampled in each cell of the first half of the lattice, scaled by the share of the cell's solid
+        angle that each stands for. The cells of the second half are their antipodes.
+    bits : (n, ceil(s·r/16)) uint8
+        Visibility along each of `vectors` or its opposite, whichever is above the horizon; packed in their order.
     rays : int
-        Rays traced: one for every two directions, since the other is below the horizon.
+        Rays traced.
     """
 
     normals: np.ndarray
@@ -38,7 +38,7 @@ class DirectTransport:
     @property
     def shape(self):
         """(n, s)."""
-        return len(self.normals), 2 * self.vectors.shape[2]
+        return len(self.normals), 2 * self.vectors.shape[1]
 
     def rows(self, index):
         """Rows of the transport matrix.
@@ -52,13 +52,18 @@ class DirectTransport:
         (b, s) float32
             Irradiance per unit radiance of each cell, per steradian.
         """
-        shape = self.vectors.shape[:3]
-        cosines = self.normals[index] @ self.vectors.reshape(-1, 3).T
-        np.maximum(cosines, 0, out=cosines)
-        cosines *= np.unpackbits(self.bits[index], axis=1, count=cosines.shape[1])
-        if shape[1] > 1:
-            cosines = cosines.reshape(-1, *shape).sum(axis=2)
-        return cosines.reshape(-1, self.shape[1])
+        rays, half, _ = self.vectors.shape
+        seen = self.normals[index] @ self.vectors.reshape(-1, 3).T
+        seen *= np.unpackbits(self.bits[index], axis=1, count=seen.shape[1])
+        # max(0, x) goes to a direction, max(0, −x) = max(0, x) − x to its opposite.
+        rows = np.empty((len(seen), 2 * half), np.float32)
+        if rays == 1:
+            np.maximum(seen, 0, out=rows[:, :half])
+        else:
+            np.maximum(seen, 0).reshape(-1, rays, half).sum(axis=1, out=rows[:, :half])
+            seen = seen.reshape(-1, rays, half).sum(axis=1)
+        np.subtract(rows[:, :half], seen, out=rows[:, half:])
+        return rows
 
     def blocks(self, size=128):
         """All rows in order, `size` at a time."""
@@ -89,9 +94,8 @@ def sample_direct(scene, points, directions, rays_per_direction=1, progress=lamb
     DirectTransport
     """
     vectors, fractions = directions.subdivided(rays_per_direction)
-    # From (s, r) to (2, r, s/2): opposite directions half the rays apart, and the rays of a cell summed along a row.
-    order = np.arange(len(directions) * rays_per_direction).reshape(2, -1, rays_per_direction).transpose(0, 2, 1)
-    vectors, fractions = vectors.reshape(-1, 3)[order], fractions.ravel()[order]
+    half = len(directions) // 2
+    vectors, fractions = vectors[:half].swapaxes(0, 1), fractions[:half].T
     tracer = VisibilityTracer(scene, points, vectors.reshape(-1, 3))
     step = max(1, LANES // tracer.lanes_per_point)
     packed = []
@@ -105,31 +109,31 @@ def sample_direct(scene, points, directions, rays_per_direction=1, progress=lamb
 class VisibilityTracer:
     """Occlusion rays from points into fixed directions, in blocks that share one kernel.
 
-    Of two opposite directions one lies above the horizon of any point, so a lane takes a pair of them and traces that one:
-    no lane is idle. What changes from block to block is opaque to the compiler; literals would compile a kernel each.
+    Of two opposite directions one lies above the horizon of any point: each lane traces that one, and none is idle. What
+    changes from block to block is opaque to the compiler; literals would compile a kernel each.
 
     Parameters
     ----------
     scene : Scene
     points : Points
     vectors : (k, 3) float32
-        vectors[j + k/2] = −vectors[j].
+        One of each pair of opposite directions.
     """
 
     def __init__(self, scene, points, vectors):
         mi = mitsuba()
         self.occluders = scene.occluders
-        self.lanes_per_point = len(vectors) // 2
+        self.lanes_per_point = len(vectors)
         # Rays start on the side of the surface that reflects. One that dips below the faces around its vertex (the
         # hemisphere of a smooth normal can) runs into them and is blocked, as it is in Mitsuba's own rendering.
         origins = points.positions + np.float32(RAY_OFFSET * scene.scale) * points.geometric_normals
         self._vectors, self._origins, self._normals = (
             mi.Float(np.pad(x, ((0, 0), (0, 1))).ravel())  # 4 floats each: gathered in one load
-            for x in (vectors[: self.lanes_per_point], origins, points.normals)
+            for x in (vectors, origins, points.normals)
         )
 
     def rays(self, first, size):
-        """The rays above the horizon of points first…first+size, point by point, and whether each is the pair's first."""
+        """The rays above the horizon of points first…first+size, point by point."""
         import drjit as dr
 
         mi = mitsuba()
@@ -142,35 +146,32 @@ class VisibilityTracer:
         local = lane // self.lanes_per_point  # the divisor is the same in all blocks, so it may be a literal
         point = local + dr.opaque(mi.UInt32, first)
         direction = vectors(self._vectors, lane - local * self.lanes_per_point)
-        upward = dr.dot(vectors(self._normals, point), direction) > 0
-        return mi.Ray3f(vectors(self._origins, point), dr.select(upward, direction, -direction)), upward
+        above = dr.mulsign(direction, dr.dot(vectors(self._normals, point), direction))
+        return mi.Ray3f(vectors(self._origins, point), above)
 
     def stream(self, blocks):
-        """Packed visibility (size, k/8) uint8 of each block (first, size); False below the horizon.
+        """Packed visibility (size, ceil(k/8)) uint8 of each block (first, size).
 
         Each block is started before the one before it is read, so that rays are traced while bits are packed.
         """
         waiting = None
         for first, size in blocks:
-            started = self._start(first, size), size
-            if waiting:
-                yield _packed(*waiting)
+            started = self._start(first, size)
+            if waiting is not None:
+                yield self._packed(waiting)
             waiting = started
-        if waiting:
-            yield _packed(*waiting)
+        if waiting is not None:
+            yield self._packed(waiting)
 
     def _start(self, first, size):
         import drjit as dr
 
-        ray, upward = self.rays(first, size)
-        visible = ~self.occluders.ray_test(ray)
-        halves = visible & upward, visible & ~upward
-        dr.eval(halves)  # returns at once; reading the arrays waits
-        return halves
+        visible = ~self.occluders.ray_test(self.rays(first, size))
+        dr.eval(visible)  # returns at once; reading the array waits
+        return visible
 
-
-def _packed(halves, size):
-    return np.packbits(np.concatenate([np.array(half).reshape(size, -1) for half in halves], axis=1), axis=1)
+    def _packed(self, visible):
+        return np.packbits(np.array(visible).reshape(-1, self.lanes_per_point), axis=1)
 
 
 def find_buried(scene, points, dark):
