@@ -142,7 +142,7 @@ class Asset:
     def _write(self, path):
         import h5py
 
-        with h5py.File(path, "w", libver="latest") as file:
+        with h5py.File(path, "w") as file:
             file.attrs["format"] = FORMAT
             file.attrs["format_version"] = FORMAT_VERSION
             for name in ("scene", "settings", "versions", "report"):

@@ -1,0 +1,231 @@
+"""The command line: exact JSON keys, exit codes, one-line errors, files written."""
+
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import h5py
+import numpy as np
+import OpenEXR
+import pytest
+
+import mi_prt
+from mi_prt.cli import main
+
+SCENES = Path(__file__).resolve().parent.parent / "scenes"
+FAST = ("--directions", "cubemap:8", "--coefficients", "16")
+
+
+def run(capsys, *arguments):
+    """Exit code, stdout and stderr of `mi-prt arguments` in this process."""
+    with pytest.raises(SystemExit) as exit:
+        main([str(a) for a in arguments])
+    captured = capsys.readouterr()
+    return exit.value.code or 0, captured.out, captured.err
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    """A copy of the Cornell box, so that it may be moved and changed."""
+    folder = tmp_path_factory.mktemp("scene")
+    shutil.copytree(SCENES / "textures", folder / "textures")
+    return Path(shutil.copy(SCENES / "cornell_sky.xml", folder / "box.xml"))
+
+
+@pytest.fixture(scope="module")
+def asset(scene, tmp_path_factory):
+    path = tmp_path_factory.mktemp("asset") / "box.prt"
+    mi_prt.precompute(scene, directions="cubemap:8", coefficients=16, edge_length=0.2).save(path)
+    return path
+
+
+def test_precompute_prints_the_promised_keys_and_nothing_else_on_stdout(scene, tmp_path, capsys):
+    code, out, err = run(capsys, "precompute", scene, "-o", tmp_path / "a.prt", *FAST, "--edge-length", "0.2", "--json")
+    result = json.loads(out)
+    assert code == 0
+    assert set(result) == {
+        "points", "directions", "coefficients", "captured_variance", "bytes", "rays", "kernels", "peak_memory_bytes", "seconds",
+    }
+    assert set(result["seconds"]) == {"scene", "points", "transport", "basis", "write", "total"}
+    assert result["directions"] == 384 and result["coefficients"] == 16
+    assert result["bytes"] == (tmp_path / "a.prt").stat().st_size
+    assert result["rays"] == result["points"] * 384 // 2
+
+
+def test_relight_writes_every_format(asset, tmp_path, capsys):
+    for name, extra in (
+        ("a.exr", ()), ("a.png", ()), ("raster.png", ("--renderer", "raster")), ("a.ply", ()), ("a.npz", ("--rotate", "0,1,1:30")),
+    ):
+        code, out, _ = run(capsys, "relight", asset, "-o", tmp_path / name, "--size", "32x24", "--spp", "4", "--json", *extra)
+        result = json.loads(out)
+        assert code == 0 and set(result) == {"points", "seconds"}
+        assert set(result["seconds"]) == {"project", "relight", "render"}
+        assert (tmp_path / name).stat().st_size > 100
+    with OpenEXR.File(str(tmp_path / "a.exr")) as file:
+        assert file.channels()["RGB"].pixels.shape == (24, 32, 3)
+    assert set(np.load(tmp_path / "a.npz")) >= {"positions", "irradiance", "radiance"}
+
+
+def test_turning_the_light_once_round_changes_nothing_and_half_way_does(asset, tmp_path, capsys):
+    """A rotation by 360 degrees is the identity; the box is open to one side, so 180 degrees is not."""
+    radiance = {}
+    for degrees in (0, 180, 360):
+        run(capsys, "relight", asset, "-o", tmp_path / "a.npz", "--rotate", f"y:{degrees}")
+        radiance[degrees] = np.load(tmp_path / "a.npz")["radiance"]
+    assert np.linalg.norm(radiance[360] - radiance[0]) < 1e-3 * np.linalg.norm(radiance[0])
+    assert np.linalg.norm(radiance[180] - radiance[0]) > 0.1 * np.linalg.norm(radiance[0])
+
+
+def test_compare_prints_the_promised_keys_and_leaves_a_report(asset, tmp_path, capsys):
+    code, out, _ = run(capsys, "compare", asset, "-o", tmp_path / "r", "--size", "64x48", "--spp", "32", "--json")
+    result = json.loads(out)
+    assert code == 0
+    assert set(result["points"]) >= {"count", "relative_rmse", "bias", "reference_noise"}
+    assert set(result["image"]) >= {"relative_rmse", "bias", "psnr", "flip", "reference_noise"}
+    assert set(result["seconds"]) == {"relight", "reference"}
+    assert result["reference"] == "modelled"
+    names = {path.name for path in (tmp_path / "r").iterdir()}
+    assert names == {
+        "report.json", "index.html", "result.exr", "reference.exr", "result.png", "reference.png", "error.png", "flip.png",
+        "side_by_side.png",
+    }
+    assert json.loads((tmp_path / "r" / "report.json").read_text()) == result
+    page = (tmp_path / "r" / "index.html").read_text()
+    assert "{" not in page.split("</style>")[1] and "modelled" in page
+
+
+def test_info_of_a_scene_and_of_an_asset(scene, asset, capsys):
+    code, out, _ = run(capsys, "info", scene, "--directions", "cubemap:4", "--json")
+    result = json.loads(out)
+    assert code == 0
+    assert set(result) == {"requires", "settings", "left_out", "predicted"}
+    assert set(result["predicted"]) == {"seconds", "peak_memory_bytes", "bytes"}
+    assert all({"value", "reason"} == set(entry) for entry in result["settings"].values())
+    code, out, _ = run(capsys, "info", asset, "--json")
+    assert code == 0 and json.loads(out)["coefficients"] == 16
+
+
+def test_what_info_predicts_is_what_precompute_needs(scene, tmp_path, capsys):
+    """Points and rays are counted, not guessed, so they agree exactly; bytes to 20 % (the container's own overhead)."""
+    _, out, _ = run(capsys, "info", scene, "--directions", "cubemap:8", "--coefficients", "16", "--json")
+    predicted = json.loads(out)
+    _, out, _ = run(capsys, "precompute", scene, "-o", tmp_path / "a.prt", *FAST, "--json")
+    found = json.loads(out)
+    assert predicted["requires"]["points"] == found["points"]
+    assert predicted["requires"]["rays"] == found["rays"]
+    assert predicted["predicted"]["bytes"] == pytest.approx(found["bytes"], rel=0.2)
+
+
+def test_same_seed_same_file(scene, tmp_path, capsys):
+    files = []
+    for name in ("a.prt", "b.prt"):
+        run(capsys, "precompute", scene, "-o", tmp_path / name, *FAST, "--seed", "3")
+        files.append((tmp_path / name).read_bytes())
+    assert files[0] == files[1]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("precompute", "missing.xml", "-o", "x.prt"), "does not exist"),
+        (("precompute", "{broken}", "-o", "x.prt"), "Mitsuba rejects"),
+        (("precompute", "{empty}", "-o", "x.prt"), "no shapes"),
+        (("precompute", "{scene}", "-o", "missing/x.prt"), "does not exist"),
+        (("precompute", "{scene}", "-o", "{folder}/x.prt", "--coefficients", "99999"), "at most 6144"),
+        (("precompute", "{scene}", "-o", "{folder}/x.prt", "--directions", "cubemap:0"), "outside 1…512"),
+        (("precompute", "{scene}", "-o", "{folder}/x.prt", "--directions", "ball:3"), "cubemap:N"),
+        (("precompute", "{scene}", "-o", "{folder}/x.prt", "--edge-length", "short"), "neither 'auto'"),
+        (("precompute", "{scene}", "-o", "{folder}/x.prt", "--rays-per-direction", "0"), "1…64"),
+        (("precompute", "{scene}", "-o", "{folder}/x.prt", "--threads", "0"), "threads"),
+        (("precompute", "{scene}", "-o", "{folder}/x.prt", "-D", "nonsense"), "NAME=VALUE"),
+        (("relight", "missing.prt", "-o", "{folder}/x.png"), "does not exist"),
+        (("relight", "{scene}", "-o", "{folder}/x.png"), "no mi_prt asset"),
+        (("relight", "{truncated}", "-o", "{folder}/x.png"), "truncated"),
+        (("relight", "{foreign}", "-o", "{folder}/x.png"), "no mi_prt asset"),
+        (("relight", "{asset}", "-o", "{folder}/x.jpg"), ".exr, .png, .ply, .npz"),
+        (("relight", "{asset}", "-o", "{folder}/x.png", "--sensor", "7"), "sensors 0…0"),
+        (("relight", "{asset}", "-o", "{folder}/x.png", "--size", "0x4"), "at least 1x1"),
+        (("relight", "{asset}", "-o", "{folder}/x.png", "--size", "big"), "WxH"),
+        (("relight", "{asset}", "-o", "{folder}/x.png", "--rotate", "y"), "AXIS:DEGREES"),
+        (("relight", "{asset}", "-o", "{folder}/x.png", "--rotate", "0,0,0:3"), "no axis"),
+        (("relight", "{asset}", "-o", "{folder}/x.png", "--envmap", "missing.exr"), "does not exist"),
+        (("relight", "{asset}", "-o", "{folder}/x.png", "--envmap", "{nan}"), "NaN or infinite"),
+        (("relight", "{asset}", "-o", "{folder}/x.png", "--envmap", "{red_green}"), "lacks B"),
+        (("relight", "{asset}", "-o", "{folder}/x.png", "--envmap", "{negative}"), "negative pixels"),
+        (("relight", "{asset}", "-o", "{folder}/x.png", "--renderer", "crayons"), "mitsuba or raster"),
+        (("compare", "{asset}", "-o", "{folder}/c", "--reference", "hearsay"), "modelled or full"),
+        (("compare", "{asset}", "-o", "{asset}"), "cannot be written"),
+        (("compare", "{asset}", "-o", "{folder}/c", "--scene", "{other}"), "not the scene of the asset"),
+        (("relight",), "Missing argument"),
+        (("frobnicate",), "No such command"),
+    ],
+)
+def test_bad_input_is_one_clear_line_and_exit_code_2(arguments, said, bad_inputs, capsys):
+    code, out, err = run(capsys, *(a.format(**bad_inputs) for a in arguments))
+    assert code == 2
+    assert said in " ".join(err.split())
+    assert out == "" and "Traceback" not in err
+    if "Missing argument" not in said and "No such command" not in said:
+        assert [line for line in err.splitlines() if line.strip()][-1].startswith("mi-prt: ")
+
+
+@pytest.fixture(scope="module")
+def bad_inputs(scene, asset, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("bad")
+    (folder / "broken.xml").write_text("<scene version='3.0.0'><shape type='sphere'></scene>")
+    (folder / "empty.xml").write_text("<scene version='3.0.0'><emitter type='constant'/></scene>")
+    (folder / "other.xml").write_text("<scene version='3.0.0'><shape type='sphere'/><emitter type='constant'/></scene>")
+    (folder / "truncated.prt").write_bytes(asset.read_bytes()[: asset.stat().st_size // 2])
+    with h5py.File(folder / "foreign.prt", "w") as file:
+        file["x"] = np.zeros(3)
+    pixels = np.ones((8, 16, 3), np.float32)
+    for name, value in (("nan", np.nan), ("negative", -1.0)):
+        changed = pixels.copy()
+        changed[3, 4] = value
+        OpenEXR.File({}, {"RGB": changed}).write(str(folder / f"{name}.exr"))
+    OpenEXR.File({}, {"R": pixels[..., 0], "G": pixels[..., 0]}).write(str(folder / "red_green.exr"))
+    return {path.stem: path for path in folder.iterdir()} | {"scene": scene, "asset": asset, "folder": folder}
+
+
+def test_few_negative_pixels_are_counted_in_a_warning(asset, tmp_path, capsys):
+    pixels = np.ones((64, 128, 3), np.float32)
+    pixels[30, 4:7] = -1e-3
+    OpenEXR.File({}, {"RGB": pixels}).write(str(tmp_path / "sky.exr"))
+    code, _, err = run(capsys, "relight", asset, "-o", tmp_path / "a.npz", "--envmap", tmp_path / "sky.exr")
+    assert code == 0 and "3 negative pixels" in err
+
+
+def test_a_scene_without_light_needs_a_map(tmp_path, capsys):
+    (tmp_path / "dark.xml").write_text("<scene version='3.0.0'><shape type='sphere'/></scene>")
+    assert run(capsys, "precompute", tmp_path / "dark.xml", "-o", tmp_path / "a.prt", *FAST)[0] == 0
+    code, _, err = run(capsys, "relight", tmp_path / "a.prt", "-o", tmp_path / "a.npz")
+    assert code == 2 and "no distant light" in err
+    OpenEXR.File({}, {"RGB": np.ones((4, 8, 3), np.float32)}).write(str(tmp_path / "sky.exr"))
+    assert run(capsys, "relight", tmp_path / "a.prt", "-o", tmp_path / "a.npz", "--envmap", tmp_path / "sky.exr")[0] == 0
+
+
+def test_a_moved_scene_is_named_and_found_again(scene, tmp_path, capsys):
+    moved = tmp_path / "moved"
+    shutil.copytree(scene.parent, tmp_path / "here")
+    run(capsys, "precompute", tmp_path / "here" / "box.xml", "-o", tmp_path / "a.prt", *FAST)
+    (tmp_path / "here").rename(moved)
+    code, _, err = run(capsys, "relight", tmp_path / "a.prt", "-o", tmp_path / "a.npz")
+    assert code == 2 and "not there any more" in err and "--scene" in err
+    code, _, _ = run(capsys, "relight", tmp_path / "a.prt", "-o", tmp_path / "a.npz", "--scene", moved / "box.xml")
+    assert code == 0
+
+
+def test_interrupting_leaves_nothing_behind(scene, tmp_path):
+    """SIGINT while rays are traced: exit code 1, no asset, no temporary file, no traceback."""
+    command = [sys.executable, "-m", "mi_prt", "precompute", str(scene), "-o", str(tmp_path / "a.prt")]
+    process = subprocess.Popen([*command, "--rays-per-direction", "64"], stderr=subprocess.PIPE, text=True)
+    time.sleep(4)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode in (1, 130)
+    assert list(tmp_path.iterdir()) == []
+    assert "Traceback" not in err
