@@ -16,6 +16,7 @@ from .errors import AssetError
 from .files import replacing
 from .lighting.cells import cell_radiance
 from .lighting.lattice import on_lattice
+from .parallel import one_blas_thread
 from .points.lattice import Patches
 from .points.points import Points
 
@@ -104,7 +105,8 @@ class Asset:
 
         What compression leaves below zero is zero.
         """
-        irradiance = self.coefficients @ coefficients
+        with one_blas_thread():
+            irradiance = self.coefficients @ coefficients
         irradiance += mean_response
         return np.maximum(irradiance, 0, out=irradiance)
 

@@ -9,6 +9,7 @@ from .asset import Asset
 from .basis.pca import BLOCK_ROWS, fit_pca
 from .directions import parse_directions
 from .errors import SettingsError
+from .parallel import map_chunks
 from .points.points import sample_points
 from .provenance import describe_scene
 from .runtime import count_kernels, peak_memory_bytes, versions
@@ -67,7 +68,7 @@ def precompute(scene, parameters=None, progress=None, **settings):
     parameters : dict, optional
         Values for an XML file's `<default>` parameters.
     progress : callable(stage, done, total), optional
-        Called as work advances; stages are 'transport' and 'basis'.
+        Called as work advances; stages are 'transport', 'basis' and 'coefficients'.
     **settings
         Fields of `Settings`: directions, coefficients, edge_length, rays_per_direction, seed.
 
@@ -152,16 +153,22 @@ def _compress(transport, directions, buried, settings, progress):
     n = len(transport.bits)
     kept = np.flatnonzero(~buried) if not buried.all() else np.arange(n)
     wanted = DEFAULT_COEFFICIENTS if settings.coefficients is None else settings.coefficients
-    basis = fit_pca(transport.rows, kept, directions.solid_angles, wanted, settings.seed)
+    basis = fit_pca(
+        transport.rows, kept, directions.solid_angles, wanted, settings.seed, lambda *done: progress("basis", *done)
+    )
     if settings.coefficients is not None and len(basis.vectors) < settings.coefficients:
         raise SettingsError(
             f"{settings.coefficients} coefficients are above the rank of the transport: at most {len(basis.vectors)}"
         )
     coefficients = np.empty((n, len(basis.vectors)), np.float32)
-    for first in range(0, n, BLOCK_ROWS):
-        block = slice(first, min(first + BLOCK_ROWS, n))
+
+    def encode(first):
+        block = slice(first, first + BLOCK_ROWS)
         coefficients[block] = basis.encode(transport.rows(block))
-        progress("basis", block.stop, n)
+        return min(first + BLOCK_ROWS, n)
+
+    for done in map_chunks(encode, range(0, n, BLOCK_ROWS)):
+        progress("coefficients", done, n)
     return basis, coefficients
 
 

@@ -32,7 +32,7 @@ from mi_prt.transport.direct import sample_direct
 
 mi = mitsuba()
 
-CELL_RADIUS = np.pi / 4 / 32 * 2**0.5  # no direction is farther than this from its cell's centre in cubemap:32
+CELL_RADIUS = np.pi / 4 / 32 * (8 / 3) ** 0.5  # no direction is farther than this from its cell's centre in cubemap:32
 
 
 def precompute(parts, directions="cubemap:32", **settings):

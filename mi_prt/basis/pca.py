@@ -10,7 +10,10 @@ from functools import cached_property
 import numpy as np
 import scipy.linalg
 
+from ..parallel import map_chunks
+
 BLOCK_ROWS = 128  # rows worked on at a time: a block of a few MB stays in the processor's cache
+CHUNKS = 16  # parts that the rows are split into for the threads; fixed, so that sums do not depend on their number
 OVERSAMPLING = 16
 SAMPLE_ITERATIONS = 2  # power iterations on a quarter of the rows, which find nearly the subspace of all
 ITERATIONS = 1  # power iterations on all rows, before the final projection
@@ -83,7 +86,7 @@ class PCA:
         return compensated @ (self.vectors @ (radiance * self.sqrt_weights[:, None]))
 
 
-def fit_pca(rows, index, weights, components, seed=0):
+def fit_pca(rows, index, weights, components, seed=0, progress=lambda done, total: None):
     """Fit the basis to a matrix that is only ever seen in blocks of rows.
 
     The leading subspace comes from block subspace iteration on the covariance (a randomized range finder with power
@@ -101,6 +104,8 @@ def fit_pca(rows, index, weights, components, seed=0):
         d; fewer are returned where the matrix has a lower rank.
     seed : int
         Of the random start.
+    progress : callable(done, total)
+        Called after every pass over the rows.
 
     Returns
     -------
@@ -116,7 +121,7 @@ def fit_pca(rows, index, weights, components, seed=0):
     if subspace > largest / 3 or min(n, s) <= EXACT_SIDE:
         values, vectors = _exact(rows, index, mean, sqrt_weights, components)
     else:
-        values, vectors = _subspace_iteration(rows, index, mean, sqrt_weights, components, subspace, seed)
+        values, vectors = _subspace_iteration(rows, index, mean, sqrt_weights, components, subspace, seed, progress)
     # Rows are float32: what is below their rounding carries nothing.
     rank = int((values > RANK_TOLERANCE * squares).sum())
     captured = values[:rank] / variance if variance > 0 else values[:rank]
@@ -135,23 +140,33 @@ def _blocks(rows, index):
 
 def _moments(rows, index, sqrt_weights):
     """Weighted mean (s,) float64 of the rows and the sum of their squares."""
-    total = np.zeros(len(sqrt_weights))
-    squares = 0.0
-    for block in _blocks(rows, index):
-        total += block.sum(axis=0)
-        block *= sqrt_weights
-        squares += float(np.vdot(block, block))
-    return total / len(index) * sqrt_weights, squares
+
+    def moments(chunk):
+        total = np.zeros(len(sqrt_weights))
+        squares = 0.0
+        for block in _blocks(rows, chunk):
+            total += block.sum(axis=0)
+            block *= sqrt_weights
+            squares += float(np.vdot(block, block))
+        return total, squares
+
+    totals, squares = zip(*map_chunks(moments, np.array_split(index, CHUNKS)))
+    return sum(totals) / len(index) * sqrt_weights, sum(squares)
 
 
-def _subspace_iteration(rows, index, mean, sqrt_weights, components, subspace, seed):
+def _subspace_iteration(rows, index, mean, sqrt_weights, components, subspace, seed, progress):
     basis = np.random.default_rng(seed).standard_normal((len(sqrt_weights), subspace)).astype(np.float32)
     sample = index[:: 4 if len(index) > 40 * subspace else 1]
-    for part in [sample] * SAMPLE_ITERATIONS + [index] * ITERATIONS:
+    passes = [sample] * SAMPLE_ITERATIONS + [index] * ITERATIONS
+    for done, part in enumerate(passes, start=1):
         basis = np.linalg.qr(_covariance_times(rows, part, mean, sqrt_weights, basis))[0].astype(np.float32)
-    ritz = np.zeros((subspace, subspace))
-    for _, narrow in _narrow(rows, index, mean, sqrt_weights, basis):
-        ritz += narrow.T @ narrow
+        progress(done, len(passes) + 1)
+
+    def gram(chunk):
+        return sum(narrow.T @ narrow for _, narrow in _narrow(rows, chunk, mean, sqrt_weights, basis))
+
+    ritz = sum(g.astype(np.float64) for g in map_chunks(gram, np.array_split(index, CHUNKS)))
+    progress(len(passes) + 1, len(passes) + 1)
     values, rotation = scipy.linalg.eigh(ritz)
     leading = slice(None, -components - 1, -1)
     return np.maximum(values[leading], 0), basis @ rotation[:, leading]
@@ -159,12 +174,19 @@ def _subspace_iteration(rows, index, mean, sqrt_weights, components, subspace, s
 
 def _covariance_times(rows, index, mean, sqrt_weights, basis):
     """XᵀX·basis for the centred, weighted rows X."""
-    product = np.zeros(basis.shape)
-    total = np.zeros(basis.shape[1])
-    for block, narrow in _narrow(rows, index, mean, sqrt_weights, basis):
-        product += block.T @ narrow
-        total += narrow.sum(axis=0, dtype=np.float64)
-    return product * sqrt_weights[:, None] - np.outer(mean, total)
+
+    def product(chunk):
+        product = np.zeros(basis.shape)
+        total = np.zeros(basis.shape[1])
+        for block, narrow in _narrow(rows, chunk, mean, sqrt_weights, basis):
+            product += block.T @ narrow
+            total += narrow.sum(axis=0, dtype=np.float64)
+        return product, total
+
+    products, totals = 0.0, 0.0
+    for one, total in map_chunks(product, np.array_split(index, CHUNKS)):
+        products, totals = products + one, totals + total
+    return products * sqrt_weights[:, None] - np.outer(mean, totals)
 
 
 def _narrow(rows, index, mean, sqrt_weights, basis):
