@@ -17,7 +17,6 @@ import mi_prt
 from mi_prt.basis.pca import fit_pca
 from mi_prt.directions import parse_directions
 from mi_prt.evaluate import metrics
-from mi_prt.evaluate.compare import subset
 from mi_prt.evaluate.ground_truth import point_irradiance
 from mi_prt.lighting.cells import cell_radiance
 from mi_prt import LightWarning
@@ -56,7 +55,7 @@ def main():
     print("|---|" + "---:|" * (4 + 4 * len(COEFFICIENTS)))
     for path in sorted((arguments.assets / "hdr").glob("*.exr")):
         environment = mi_prt.EnvironmentMap(path)
-        truth = point_irradiance(lit_scene(scene.mi_scene, environment), subset(points, chosen), arguments.samples)
+        truth = point_irradiance(lit_scene(scene.mi_scene, environment), points.at(chosen), arguments.samples)
         radiance = cell_radiance(environment, directions)
         full = rows @ (radiance * directions.solid_angles[:, None]).astype(np.float32)
         cells = [path.stem, f"{truth.noise:.4f}", *_errors(full, truth)]

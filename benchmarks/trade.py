@@ -14,7 +14,6 @@ import numpy as np
 
 import mi_prt
 from mi_prt.evaluate import metrics
-from mi_prt.evaluate.compare import subset
 from mi_prt.evaluate.ground_truth import point_irradiance
 from mi_prt.lighting.scene_light import lit_scene, scene_light
 from mi_prt.precompute import measure
@@ -43,7 +42,7 @@ def main():
             asset, cost = measure(scene, directions=directions, rays_per_direction=rays, coefficients=coefficients)
             if truths is None:
                 chosen = np.sort(np.random.default_rng(0).permutation(len(asset.points))[:2000])
-                at = subset(asset.points, chosen)
+                at = asset.points.at(chosen)
                 truths = [point_irradiance(lit_scene(scene.mi_scene, light), at, 8192) for light in lights]
             projected = [asset.project_light(light) for light in lights]
             results = np.stack([asset.irradiance_from(*light)[chosen] for light in projected])

@@ -3,6 +3,7 @@
 The file is read with NumPy and h5py alone; docs/asset-format.md describes it field by field.
 """
 
+import io
 import json
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -17,8 +18,8 @@ from .files import replacing
 from .lighting.cells import cell_radiance
 from .lighting.lattice import on_lattice
 from .parallel import one_blas_thread
-from .points.lattice import Patches
-from .points.points import Points
+from .points.lattice import Patches, node_count
+from .points.points import POINT_FIELDS, Points
 
 FORMAT = "mi_prt asset"
 FORMAT_VERSION = 1
@@ -32,7 +33,6 @@ UNITS = {
     "irradiance": "W/m^2",
     "outgoing radiance": "W/(m^2 sr)",
 }
-_POINT_FIELDS = ("positions", "normals", "geometric_normals", "albedo", "areas", "uv", "surface")
 _PATCH_FIELDS = ("levels", "offsets", "nodes", "back")
 _BASIS_FIELDS = ("vectors", "mean", "sqrt_weights", "captured_variance")
 
@@ -137,20 +137,23 @@ class Asset:
             If the path cannot be written.
         """
         path = Path(path)
+        # HDF5 crashes where a disk is full; plain bytes raise.
+        content = io.BytesIO()
+        self._write(content)
         with replacing(path) as temporary:
-            self._write(temporary)
+            Path(temporary).write_bytes(content.getbuffer())
         object.__setattr__(self, "path", path.absolute())
 
-    def _write(self, path):
+    def _write(self, stream):
         import h5py
 
-        with h5py.File(path, "w") as file:
+        with h5py.File(stream, "w") as file:
             file.attrs["format"] = FORMAT
             file.attrs["format_version"] = FORMAT_VERSION
             for name in ("scene", "settings", "versions", "report"):
                 file.attrs[name] = json.dumps(getattr(self, name), sort_keys=True)
             file.attrs["units"] = json.dumps(UNITS, sort_keys=True)
-            for name in _POINT_FIELDS:
+            for name in POINT_FIELDS:
                 file[f"points/{name}"] = getattr(self.points, name)
             file["points/buried"] = self.buried
             file["points"].attrs["report"] = json.dumps(self.points.report, sort_keys=True)
@@ -200,7 +203,7 @@ def load(path):
             if not file.attrs.get("complete"):
                 raise AssetError(f"asset '{path}' is incomplete: precompute it again")
             return _read(file, path)
-    except (OSError, KeyError, ValueError) as error:
+    except (OSError, KeyError, TypeError, ValueError) as error:
         if isinstance(error, AssetError):
             raise
         reason = " ".join(str(error).split())
@@ -210,9 +213,9 @@ def load(path):
 def _read(file, path):
     texts = {name: json.loads(file.attrs[name]) for name in ("scene", "settings", "versions", "report")}
     points = file["points"]
-    return Asset(
+    asset = Asset(
         points=Points(
-            **{name: points[name][()] for name in _POINT_FIELDS},
+            **{name: points[name][()] for name in POINT_FIELDS},
             patches=Patches(**{name: points[f"patches/{name}"][()] for name in _PATCH_FIELDS}),
             surfaces=tuple(json.loads(points.attrs["surfaces"])),
             report=json.loads(points.attrs["report"]),
@@ -224,3 +227,30 @@ def _read(file, path):
         path=path.absolute(),
         **texts,
     )
+    _check_shapes(asset)
+    return asset
+
+
+def _check_shapes(asset):
+    """Raise ValueError unless the arrays of an asset fit together."""
+    n, s, d = len(asset.points), len(asset.directions), len(asset.basis.vectors)
+    patches = asset.points.patches
+    p = len(patches.levels)
+    expected = {
+        **{f"points/{name}": (getattr(asset.points, name), (n, 3)) for name in POINT_FIELDS[:5]},
+        "points/uv": (asset.points.uv, (n, 2)),
+        **{f"points/{name}": (getattr(asset.points, name), (n,)) for name in ("areas", "surface")},
+        "points/buried": (asset.buried, (n,)),
+        "points/patches/levels": (patches.levels, (p, 2)),
+        "points/patches/offsets": (patches.offsets, (p,)),
+        "points/patches/back": (patches.back, (p,)),
+        "points/patches/nodes": (patches.nodes, (int(node_count(*patches.levels.T.astype(np.int64)).sum()),)),
+        "basis/vectors": (asset.basis.vectors, (d, s)),
+        "basis/mean": (asset.basis.mean, (s,)),
+        "basis/sqrt_weights": (asset.basis.sqrt_weights, (s,)),
+        "basis/captured_variance": (asset.basis.captured_variance, (d,)),
+        "coefficients": (asset.coefficients, (n, d)),
+    }
+    for name, (array, shape) in expected.items():
+        if array.shape != shape:
+            raise ValueError(f"{name} is of shape {array.shape} instead of {shape}")

@@ -161,6 +161,6 @@ def parse_directions(text):
     if isinstance(text, Cubemap):
         return text
     kind, _, resolution = str(text).partition(":")
-    if kind != "cubemap" or not resolution.isdigit():
+    if kind != "cubemap" or not (resolution.isascii() and resolution.isdigit()):
         raise SettingsError(f"directions '{text}' are not known: use cubemap:N, for example cubemap:32")
     return Cubemap(int(resolution))

@@ -12,6 +12,8 @@ def check_writable(path):
     """Raise SettingsError unless a file can be created at `path`."""
     path = Path(path)
     folder = path.absolute().parent
+    if len(os.fsencode(path.name)) > 255:
+        raise SettingsError(f"output name '{path.name[:40]}…' is longer than the 255 bytes that file systems take")
     if path.is_dir():
         raise SettingsError(f"output '{path}' is a folder: give a file name")
     if not folder.is_dir():
@@ -25,7 +27,7 @@ def replacing(path):
     """Name of a new file in the same folder, which takes the place of `path` once the block has ended without error."""
     path = Path(path)
     check_writable(path)
-    handle, temporary = tempfile.mkstemp(dir=path.absolute().parent, prefix=f".{path.name}.", suffix=".part")
+    handle, temporary = tempfile.mkstemp(dir=path.absolute().parent, prefix=f".{path.name[:40]}.", suffix=".part")
     os.close(handle)
     try:
         yield temporary

@@ -87,10 +87,8 @@ def describe_asset(asset):
 
 def _probe(scene, points, directions, settings, coefficients):
     """Rays and seconds per point, from a sample of the points."""
-    from dataclasses import replace
-
     index = np.random.default_rng(settings.seed).permutation(len(points))[:PROBE_POINTS]
-    few = replace(points, **{name: getattr(points, name)[index] for name in ("positions", "normals", "geometric_normals")})
+    few = points.at(index)
     sample_direct(scene, few, directions, settings.rays_per_direction)  # compiles the kernel
     started = time.perf_counter()
     transport = sample_direct(scene, few, directions, settings.rays_per_direction)

@@ -51,6 +51,10 @@ class Settings:
 
     def __post_init__(self):
         object.__setattr__(self, "directions", str(parse_directions(self.directions)))
+        for name in ("coefficients", "rays_per_direction", "seed"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not (isinstance(value, int | np.integer) or (name == "coefficients" and value is None)):
+                raise SettingsError(f"{name} must be an integer, got {value!r}")
         if self.coefficients is not None and self.coefficients < 0:
             raise SettingsError(f"coefficients must be ≥ 0, got {self.coefficients}")
         if not 1 <= self.rays_per_direction <= MAX_RAYS_PER_DIRECTION:

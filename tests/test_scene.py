@@ -223,7 +223,7 @@ def test_shapes_without_points_are_named_and_cast_shadows(tmp_path):
     asset = mi_prt.precompute(scene(**parts, hair=curve(tmp_path / "curve.txt")), directions="cubemap:16", edge_length=0.5)
     assert ["hair"] in [e["shapes"] for e in asset.scene["left_out"]]
     assert len(asset.points) == len(plain.points)
-    assert asset.irradiance(uniform_sky()).min() < 0.98 * plain.irradiance(uniform_sky()).min()
+    assert asset.irradiance(uniform_sky()).min() < 0.995 * plain.irradiance(uniform_sky()).min()
 
 
 # --- the modelled scene --------------------------------------------------------------------------------------------

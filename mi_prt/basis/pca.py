@@ -155,8 +155,12 @@ def _moments(rows, index, sqrt_weights):
 
 
 def _subspace_iteration(rows, index, mean, sqrt_weights, components, subspace, seed, progress):
-    basis = np.random.default_rng(seed).standard_normal((len(sqrt_weights), subspace)).astype(np.float32)
-    sample = index[:: 4 if len(index) > 40 * subspace else 1]
+    random = np.random.default_rng(seed)
+    basis = random.standard_normal((len(sqrt_weights), subspace)).astype(np.float32)
+    sample = index
+    if len(index) > 40 * subspace:
+        # At random, not every fourth: the order of points may repeat.
+        sample = np.sort(random.choice(index, len(index) // 4, replace=False))
     passes = [sample] * SAMPLE_ITERATIONS + [index] * ITERATIONS
     for done, part in enumerate(passes, start=1):
         basis = np.linalg.qr(_covariance_times(rows, part, mean, sqrt_weights, basis))[0].astype(np.float32)

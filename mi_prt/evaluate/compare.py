@@ -1,7 +1,6 @@
 """An asset against Mitsuba's ground truth, at the points and in the image, with the error explained."""
 
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -80,7 +79,7 @@ def compare(
     progress("reference at the points", 1, 3)
     started = time.perf_counter()
     chosen = np.sort(np.random.default_rng(seed).permutation(len(asset.points))[:COMPARED_POINTS])
-    at_points = ground_truth.point_irradiance(truth, subset(asset.points, chosen), POINT_SAMPLES, seed)
+    at_points = ground_truth.point_irradiance(truth, asset.points.at(chosen), POINT_SAMPLES, seed)
 
     progress("reference image", 2, 3)
     with resized(pick_sensor(truth, sensor), size) as camera:
@@ -115,11 +114,6 @@ def _made_folder(folder):
     except OSError as error:
         raise SettingsError(f"output folder '{folder}' cannot be written: {error.strerror}") from None
     return folder
-
-
-def subset(points, index):
-    """Some of the points, as far as a reference needs them: positions and normals."""
-    return replace(points, **{name: getattr(points, name)[index] for name in ("positions", "normals", "geometric_normals")})
 
 
 def _errors(result, reference):

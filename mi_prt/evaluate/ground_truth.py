@@ -5,8 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..runtime import mitsuba
+from ..scene.scene import scale_of
 
 LANES = 1 << 21
+RIM_INSET = 2e-5  # share of the scene's scale by which points on the rim of a surface are moved in
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +55,9 @@ def point_irradiance(mi_scene, points, spp, seed=0):
     means, errors = np.empty((count, 3)), np.empty((count, 3))
     sampler = mi.load_dict({"type": "independent"})
     per_point = dr.opaque(mi.UInt32, spp)
-    positions, normals = mi.Float(points.positions.ravel()), mi.Float(points.normals.ravel())
+    # A rim may lie on another surface, where Mitsuba's own offset along the normal would leave rays on either side of it.
+    positions = points.positions + np.float32(RIM_INSET * scale_of(mi_scene)) * points.insets
+    positions, normals = mi.Float(positions.ravel()), mi.Float(points.normals.ravel())
     geometric = mi.Float(points.geometric_normals.ravel())
     for block, first in enumerate(range(0, count, step)):
         size = min(step, count - first)

@@ -1,7 +1,8 @@
 """Environment maps: equirectangular radiance in Mitsuba's convention, with a rotation."""
 
 import warnings
-from dataclasses import dataclass, field, replace
+from copy import copy
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -61,7 +62,7 @@ class EnvironmentMap:
 
     def rotated(self, axis, degrees):
         """The same light turned about `axis` (x, y, z or a vector of 3) by `degrees`, right-handed, in world space."""
-        turned = replace(self, source=self.pixels)
+        turned = copy(self)  # the pixels are checked already
         object.__setattr__(turned, "rotation", rotation_matrix(axis, degrees) @ self.rotation)
         return turned
 
@@ -86,31 +87,38 @@ class EnvironmentMap:
             In sr; all bands together sum to 4π.
         radiance : (k, 3) float32
         """
+        # Pixels are nodes of a bilinear function. The intervals between them are split, so that no sample spans a kink
+        # and every sample's mean radiance is exact: at the middle in u, at the mean of v over the sphere in v.
         height, width, _ = self.pixels.shape
-        splits_v = max(1, int(np.ceil(np.pi / height / spacing)))
+        intervals = max(height - 1, 1)
+        splits_v = max(1, int(np.ceil(np.pi / intervals / spacing)))
         splits_u = max(1, int(np.ceil(2 * np.pi / width / spacing)))
-        rows, columns = height * splits_v, width * splits_u
-        phi = (np.arange(columns) + 0.5) * (2 * np.pi / columns)
+        rows, columns = intervals * splits_v, width * splits_u
+        phi = ((np.arange(columns) + 0.5) / splits_u + 0.5) * (2 * np.pi / width)
         around = np.stack([np.sin(phi), np.zeros(columns), -np.cos(phi)], axis=-1)
-        left = np.floor((np.arange(columns) + 0.5) / splits_u - 0.5)
-        weight_u = ((np.arange(columns) + 0.5) / splits_u - 0.5 - left).astype(np.float32)[:, None]
-        left, right = left.astype(np.int64) % width, (left.astype(np.int64) + 1) % width
+        left = np.arange(columns) // splits_u
+        right = (left + 1) % width
+        weight_u = ((np.arange(columns) % splits_u + 0.5) / splits_u).astype(np.float32)[:, None]
         step = max(1, band // columns)
         for first in range(0, rows, step):
             row = np.arange(first, min(first + step, rows))
-            position = (row + 0.5) / rows * (height - 1)
-            above = np.minimum(position.astype(np.int64), max(height - 2, 0))
+            first_theta, last_theta = row * (np.pi / rows), (row + 1) * (np.pi / rows)
+            # Exact solid angle of a latitude band, and the mean of θ over it: ∫ θ sin θ = sin θ − θ cos θ.
+            ring = np.cos(first_theta) - np.cos(last_theta)
+            mean_theta = (_theta_moment(last_theta) - _theta_moment(first_theta)) / ring
+            above = row // splits_v
             below = np.minimum(above + 1, height - 1)
-            weight_v = (position - above).astype(np.float32)[:, None, None]
+            weight_v = (mean_theta * (intervals / np.pi) - above).astype(np.float32)[:, None, None]
             lines = self.pixels[above] * (1 - weight_v) + self.pixels[below] * weight_v
             radiance = lines[:, left] * (1 - weight_u) + lines[:, right] * weight_u
-            theta = (row + 0.5) * (np.pi / rows)
-            vectors = np.sin(theta)[:, None, None] * around + np.cos(theta)[:, None, None] * np.array([0.0, 1.0, 0.0])
+            vectors = np.sin(mean_theta)[:, None, None] * around + np.cos(mean_theta)[:, None, None] * np.array([0.0, 1.0, 0.0])
             vectors = (vectors.reshape(-1, 3) @ self.rotation.T).astype(np.float32)
-            # Exact solid angle of a latitude band; sin θ·Δθ would lose energy at the poles.
-            ring = np.cos(row * np.pi / rows) - np.cos((row + 1) * np.pi / rows)
             solid_angles = np.repeat(ring * (2 * np.pi / columns), columns).astype(np.float32)
             yield vectors, solid_angles, radiance.reshape(-1, 3).astype(np.float32)
+
+
+def _theta_moment(theta):
+    return np.sin(theta) - theta * np.cos(theta)
 
 
 def rotation_matrix(axis, degrees):
@@ -160,7 +168,10 @@ def _read(source):
         return _read_exr(path) if path.suffix.lower() == ".exr" else _read_by_mitsuba(path)
     if type(source).__module__.startswith("mitsuba"):
         return _from_bitmap(source)
-    return np.asarray(source)
+    try:
+        return np.asarray(source)
+    except ValueError:
+        raise LightError(f"an environment map is a path, an array (h, w, 3) or a mi.Bitmap, got {type(source).__name__}") from None
 
 
 def _read_exr(path):
@@ -202,7 +213,12 @@ def _from_bitmap(bitmap):
 def _validated(pixels, scale):
     if pixels.ndim != 3 or pixels.shape[2] != 3 or 0 in pixels.shape:
         raise LightError(f"an environment map must be of shape (h, w, 3), got {pixels.shape}")
-    pixels = np.asarray(pixels, dtype=np.float32) * np.float32(scale)
+    if pixels.dtype.kind not in "fiub":
+        raise LightError(f"an environment map must hold real numbers, got {pixels.dtype}")
+    if not np.isfinite(scale):
+        raise LightError(f"an environment map's scale must be finite, got {scale}")
+    with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite, and is refused below
+        pixels = pixels.astype(np.float32) * np.float32(scale)
     broken = int((~np.isfinite(pixels)).any(axis=2).sum())
     if broken:
         raise LightError(f"environment map has {broken} pixels that are NaN or infinite: repair them first")

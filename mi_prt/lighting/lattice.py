@@ -15,8 +15,8 @@ from .cells import cell_radiance
 from .environment import rotation_matrix
 from .light import DistantLight, as_light
 
-REFINEMENT = 3  # fine cells along the side of a cell of the asset
-SAMPLES_PER_FINE_SIDE = 5
+REFINEMENT = 4  # fine cells along the side of a cell of the asset
+SAMPLES_PER_FINE_SIDE = 4
 
 
 @dataclass(frozen=True, eq=False)

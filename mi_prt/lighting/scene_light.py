@@ -1,16 +1,19 @@
 """Between Mitsuba's emitters and this program's light: the distant light of a scene, and a scene under other light."""
 
 import numpy as np
+import scipy.ndimage
 
 from ..errors import LightError
 from ..runtime import mitsuba
+from ..scene.scene import rebuilt_scene
 from ..scene.traversal import children, transform_of
 from .environment import EnvironmentMap
 from .light import DirectionalLight, DistantLight, as_light
 
 BAKED_HEIGHT = 512  # rows of the map that an analytic sky is baked to
+SKY_SAMPLES = 8  # samples of every pixel
 SUN_SAMPLES = 1 << 24  # samples shared by the pixels in which a sun was found
-MOST_SPLITS = 256  # samples across one of them
+MOST_SUN_SAMPLES = 1 << 16  # samples of one of them
 SUN_SEARCH = 1 << 16  # emitter samples that look for a sun
 
 
@@ -71,15 +74,13 @@ def lit_scene(mi_scene, light=None):
         If the light has more than one environment map: Mitsuba takes one.
     """
     mi = mitsuba()
-    kept = {}
-    for i, (_, child) in enumerate(children(mi_scene)):
+    kept = []
+    for _, child in children(mi_scene):
         is_light = isinstance(child, mi.Emitter)
         replaced = is_light and light is not None and mi.has_flag(child.flags(), mi.EmitterFlags.Infinite)
         if isinstance(child, mi.Shape | mi.Sensor) or (is_light and not replaced):
-            kept[f"part{i}"] = child
-    if light is not None:
-        kept |= _emitters(as_light(light))
-    return mi.load_dict({"type": "scene", "embree_use_robust_intersections": True, **kept}, optimize=False, parallel=False)
+            kept.append(child)
+    return rebuilt_scene(kept, None if light is None else _emitters(as_light(light)))
 
 
 def turned_light(scene, light=None, rotate=None):
@@ -138,11 +139,12 @@ def _environment_map(emitter):
 def _baked(emitter):
     """Any other emitter, averaged over the pixels of a map; pixels that hold a sun are sampled densely.
 
-    The samples that Mitsuba itself would take of the emitter tell where a sun is: those brighter than the map has
-    them mark pixels to refine.
+    Samples that Mitsuba itself would take of the emitter tell where a sun is: those brighter than the map has them mark
+    pixels to refine, and so does contrast within a pixel.
     """
     height, width = BAKED_HEIGHT, 2 * BAKED_HEIGHT
-    pixels = _pixel_means(emitter, np.indices((height, width)).reshape(2, -1).T, height, 2).reshape(height, width, 3)
+    every = np.indices((height, width)).reshape(2, -1).T
+    pixels, contrast = (x.reshape(height, width, -1) for x in _pixel_means(emitter, every, height, SKY_SAMPLES))
     mi = mitsuba()
     side = int(SUN_SEARCH**0.5)
     grid = (np.indices((side, side)).reshape(2, -1) + 0.5) / side
@@ -150,32 +152,44 @@ def _baked(emitter):
     direction = np.array(sample.d).T
     row, column = _pixel_of(direction, height)
     brighter = (_rgb(weight) * np.array(sample.pdf)[:, None]).max(axis=1) > 1.5 * pixels[row, column].max(axis=1) + 1e-6
-    marked = np.zeros((height, width), bool)
-    for i in (-1, 0, 1):
-        for j in (-1, 0, 1):
-            marked[np.clip(row[brighter] + i, 0, height - 1), (column[brighter] + j) % width] = True
+    marked = contrast[..., 0] > 1.5
+    marked[row[brighter], column[brighter]] = True
+    # A neighbour may hold the edge of what was found; around a pole all columns are neighbours.
+    marked = scipy.ndimage.maximum_filter(marked, 3, mode=("nearest", "wrap"))
+    for pole in (slice(0, 3), slice(-3, None)):
+        marked[pole] |= marked[pole].any()
     found = np.argwhere(marked)
     if len(found):
-        splits = min(MOST_SPLITS, max(4, int((SUN_SAMPLES / len(found)) ** 0.5)))
-        pixels[marked] = _pixel_means(emitter, found, height, splits)
-    return EnvironmentMap(pixels)
+        samples = int(np.clip(SUN_SAMPLES // len(found), 2 * SKY_SAMPLES, MOST_SUN_SAMPLES))
+        pixels[marked], _ = _pixel_means(emitter, found, height, samples)
+    # Near the horizon Mitsuba's sun leaves the sRGB gamut, and one channel of it is negative.
+    return EnvironmentMap(np.maximum(pixels, 0))
 
 
-def _pixel_means(emitter, pixels, height, splits):
-    """Mean radiance (k, 3) over the pixels (row, column), each around its centre, from splits² samples."""
-    offsets = (np.indices((splits, splits)).reshape(2, -1).T + 0.5) / splits - 0.5
-    sums, weights = 0.0, 0.0
+def _pixel_means(emitter, pixels, height, samples):
+    """Mean radiance (k, 3) of the pixels (row, column).
+
+    Samples are weighted by the pixel's hat in bilinear interpolation: the interpolated map then has the emitter's energy,
+    at the poles too. Also the contrast (k, 1) within each pixel: its largest sample over its mean.
+    """
+    # A golden-ratio lattice, all of whose samples have latitudes of their own: at a pole the edge of a sun runs along rows.
+    place = np.arange(samples) + 0.5
+    offsets = 2 * np.stack([place / samples, place * (5**0.5 - 1) / 2 % 1], axis=-1) - 1
+    sums, weights, largest = 0.0, 0.0, 0.0
     for chunk in np.array_split(offsets, max(1, len(pixels) * len(offsets) >> 20)):
         rows = pixels[:, None, 0] + chunk[None, :, 0]
         columns = pixels[:, None, 1] + chunk[None, :, 1]
-        theta = np.clip(rows * (np.pi / (height - 1)), 0, np.pi)
+        theta = rows * (np.pi / (height - 1))
         phi = (columns + 0.5) * (np.pi / height)
-        sine = np.sin(theta)
+        sine = np.maximum(np.sin(theta), 0)  # beyond the poles there is nothing
         directions = np.stack([np.sin(phi) * sine, np.cos(theta), -np.cos(phi) * sine], axis=-1)
         radiance = _evaluate(emitter, directions.reshape(-1, 3)).reshape(*rows.shape, 3)
-        sums = sums + (radiance * sine[..., None]).sum(axis=1)
-        weights = weights + sine.sum(axis=1)[:, None]
-    return sums / np.maximum(weights, 1e-12)
+        weight = sine * (1 - np.abs(chunk)).prod(axis=1)
+        sums = sums + (radiance * weight[..., None]).sum(axis=1)
+        weights = weights + weight.sum(axis=1)[:, None]
+        largest = np.maximum(largest, radiance.max(axis=(1, 2)))
+    means = sums / np.maximum(weights, 1e-12)
+    return means, (largest / np.maximum(means.max(axis=1), 1e-12))[:, None]
 
 
 def _pixel_of(directions, height):

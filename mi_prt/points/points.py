@@ -1,6 +1,6 @@
 """The points at which transport is known, for a whole scene."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -9,6 +9,7 @@ from ..runtime import mitsuba
 from .lattice import Patches, node_count
 from .tessellate import TESSELLATED_SHAPES, patch_levels, tessellate
 
+POINT_FIELDS = ("positions", "normals", "geometric_normals", "albedo", "insets", "areas", "uv", "surface")
 POINT_BUDGET = 40_000  # points that `auto` edge length aims at, beyond the meshes' own vertices
 MAX_POINTS = 4_000_000
 
@@ -25,6 +26,8 @@ class Points:
         Mean normal of the faces around the point, on the side of `normals`.
     albedo : (n, 3) float32
         Diffuse reflectance, RGB.
+    insets : (n, 3) float32
+        Along the surface and inward at its rim, 0 elsewhere; see `ray_origins`.
     areas : (n,) float32
         m²; back sides carry their own.
     uv : (n, 2) float32
@@ -41,6 +44,7 @@ class Points:
     normals: np.ndarray
     geometric_normals: np.ndarray
     albedo: np.ndarray
+    insets: np.ndarray
     areas: np.ndarray
     uv: np.ndarray
     surface: np.ndarray
@@ -50,6 +54,14 @@ class Points:
 
     def __len__(self):
         return len(self.positions)
+
+    def at(self, index):
+        """Only the points of an index array; `patches` stay those of all points."""
+        return replace(self, **{name: getattr(self, name)[index] for name in POINT_FIELDS})
+
+    def ray_origins(self, offset):
+        """Where rays start (n, 3): `offset` metres off the surface, and as far in from its rim."""
+        return self.positions + np.float32(offset) * (self.geometric_normals + self.insets)
 
 
 def sample_points(scene, edge_length="auto"):
@@ -79,20 +91,21 @@ def sample_points(scene, edge_length="auto"):
     surfaces, backs = [], []
     counts = {"degenerate_faces": 0, "zero_normals": 0, "flipped_normals": 0, "back_points": 0}
     total = patch_total = 0
-    columns = {name: [] for name in ("positions", "normals", "geometric_normals", "albedo", "areas", "uv", "surface")}
+    columns = {name: [] for name in POINT_FIELDS}
     levels, nodes = [], []
     for index, surface in enumerate(scene.surfaces):
         if surface.kind not in TESSELLATED_SHAPES:
             surfaces.append(_describe(surface, patch_total, 0))
             continue
         part = tessellate(surface, length)
-        sides = (1, -1) if surface.material.two_sided and not part.closed else (1,)
+        sides = (1, -1) if surface.material.two_sided and not part.sealed else (1,)
         n = len(part.positions)
         for side in sides:
             columns["positions"].append(part.positions)
             columns["normals"].append(side * part.normals)
             columns["geometric_normals"].append(side * part.geometric_normals)
             columns["albedo"].append(_albedo(surface, part, side))
+            columns["insets"].append(part.insets)
             columns["areas"].append(part.areas)
             columns["uv"].append(part.uv)
             columns["surface"].append(np.full(n, index))
@@ -137,7 +150,7 @@ def choose_edge_length(scene, edge_length="auto"):
     if edge_length != "auto":
         try:
             length = float(edge_length)
-        except ValueError:
+        except (TypeError, ValueError):
             raise SettingsError(f"edge length '{edge_length}' is neither 'auto' nor a number of metres") from None
         if not (np.isfinite(length) and length > 0):
             raise SettingsError(f"edge length {edge_length} must be a positive number of metres")

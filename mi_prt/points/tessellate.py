@@ -7,7 +7,7 @@ import numpy as np
 from ..errors import SceneError
 from ..scene.scene import mesh_arrays
 from ..scene.traversal import transform_of
-from .lattice import lattice_nodes, lattice_triangles, node_count
+from .lattice import Patches, lattice_nodes, lattice_triangles, node_count
 
 MAX_LEVEL = 4096
 # Least levels (k_u, k_v) that keep the polygonal outline of a curved shape smooth, for any edge length.
@@ -23,6 +23,9 @@ class SurfacePoints:
     ----------
     positions, normals, geometric_normals : (n, 3) float64
         World space; the geometric normals look to the side of the shading normals.
+    insets : (n, 3) float64
+        At the rim of the surface the unit vector along it and inward, elsewhere 0. A rim often lies exactly on another
+        surface (a floor ends at a wall): rays must start this side of it.
     uv : (n, 2) float32
     areas : (n,) float64
         m²; they sum to the area of the surface, or of the polyhedron that stands for it.
@@ -32,8 +35,8 @@ class SurfacePoints:
         In the frame of the shape, where its attributes are looked up.
     levels : (p, 2), nodes : (t,)
         Patches as in `Patches`, with node indices local to this surface.
-    closed : bool
-        Whether the surface encloses a volume, so that its back is never seen.
+    sealed : bool
+        Whether the surface encloses a volume with the reflecting side outside, so that its back is never seen.
     counts : dict
         Irregularities found: degenerate_faces, zero_normals, flipped_normals.
     """
@@ -41,20 +44,29 @@ class SurfacePoints:
     positions: np.ndarray
     normals: np.ndarray
     geometric_normals: np.ndarray
+    insets: np.ndarray
     uv: np.ndarray
     areas: np.ndarray
     primitives: np.ndarray
     local_positions: np.ndarray
     levels: np.ndarray
     nodes: np.ndarray
-    closed: bool
+    sealed: bool
     counts: dict
 
 
 def patch_levels(surface, edge_length):
-    """Levels (p, 2) of a surface's patches so that no edge of the lattice exceeds `edge_length` metres."""
+    """Levels (p, 2) of a surface's patches so that no edge of the lattice exceeds `edge_length` metres.
+
+    Raises
+    ------
+    SceneError
+        If a mesh has positions that are NaN or infinite.
+    """
     if surface.kind == "mesh":
         corners = _world_corners(surface)
+        if not np.isfinite(corners).all():
+            raise SceneError(f"mesh '{surface.name}' has positions that are NaN or infinite: repair it first")
         longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).max(axis=1)
         k = np.clip(np.ceil(longest / edge_length - 1e-6), 1, MAX_LEVEL).astype(np.int32)
         return np.stack([k, np.zeros_like(k)], axis=-1)
@@ -81,12 +93,12 @@ def tessellate(surface, edge_length):
 
 def _tessellate_mesh(surface, levels):
     positions, faces, normals, uv = mesh_arrays(surface.shape)
-    if not np.isfinite(positions).all():
-        raise SceneError(f"mesh '{surface.name}' has positions that are NaN or infinite: repair it first")
     world = _transformed(positions, surface.to_world)
     face_normals, face_areas = _face_geometry(world, faces)
     degenerate = face_areas <= 1e-12 * max(face_areas.max(initial=0.0), 1e-300)
-    sign = -1.0 if surface.shape.has_flipped_normals() else 1.0
+    # Mitsuba turns normals with flip_normals, and with an instance that mirrors: positions mirror, normals do not.
+    sign = float(np.sign(np.linalg.det(surface.to_world[:3, :3]))) * (-1.0 if surface.shape.has_flipped_normals() else 1.0)
+    zero = 0
     if normals is None:
         # A faceted mesh has one normal per face: split each vertex into one per distinct normal around it.
         faces, source = _split_by_normal(faces, face_normals)
@@ -95,6 +107,7 @@ def _tessellate_mesh(surface, levels):
         normals = np.zeros_like(world)
         normals[faces.ravel()] = np.repeat(sign * face_normals, 3, axis=0)
     else:
+        normals, zero = _repaired_normals(normals, faces, sign * face_normals * face_areas[:, None])
         normals = normals @ np.linalg.inv(surface.to_world[:3, :3])  # inverse transpose, for row vectors
     uv = np.zeros((len(world), 2), np.float32) if uv is None else uv
 
@@ -115,25 +128,27 @@ def _tessellate_mesh(surface, levels):
         [np.bincount(identity[used], (node_areas * face_normals[face, x])[used], count) for x in range(3)], axis=-1
     )
     geometric = sign * _unit(geometric)
-    shading = at_points(normals)
-    zero = ~(np.linalg.norm(shading, axis=1) > 1e-8)  # also true for NaN
-    shading = np.where(zero[:, None], geometric, _unit(shading))
+    shading = _unit(at_points(normals))
+    shading = np.where(shading.any(axis=1)[:, None], shading, geometric)  # opposite normals cancel in between
     facing = np.sum(shading * geometric, axis=1)
-    order = _patch_order(levels[:, 0])
+    senses = np.unique(np.sign(facing))
+    nodes = identity[_patch_order(levels[:, 0])]
+    placed = at_points(world)
     return SurfacePoints(
-        positions=at_points(world),
+        positions=placed,
         normals=shading,
         geometric_normals=np.where(facing[:, None] < 0, -geometric, geometric),
+        insets=_insets(placed, geometric, levels, nodes),
         uv=at_points(uv).astype(np.float32),
         areas=areas,
         primitives=face[first],
         local_positions=at_points(positions),
         levels=levels,
-        nodes=identity[order],
-        closed=_is_closed(positions, faces[~degenerate]),
+        nodes=nodes,
+        sealed=_is_sealed(world, faces[~degenerate], senses[0] * sign) if len(senses) == 1 else False,
         counts={
             "degenerate_faces": int(degenerate.sum()),
-            "zero_normals": int(zero.sum()),
+            "zero_normals": zero,
             "flipped_normals": int((facing < -0.1).sum()),
         },
     )
@@ -212,12 +227,47 @@ def _face_geometry(positions, faces):
     return _unit(cross), np.linalg.norm(cross, axis=1) / 2
 
 
-def _is_closed(positions, faces):
-    """Whether every edge, welded by position, belongs to exactly two faces."""
+def _repaired_normals(normals, faces, weighted_face_normals):
+    """Vertex normals (v, 3) with those that are zero or not finite replaced by the faces' around, and their number."""
+    broken = np.zeros(len(normals), bool)
+    broken[faces.ravel()] = True
+    broken &= ~(np.linalg.norm(normals, axis=1) > 1e-8)  # also true for NaN
+    if not broken.any():
+        return normals, 0
+    around = np.stack(
+        [np.bincount(faces.ravel(), np.repeat(weighted_face_normals[:, x], 3), len(normals)) for x in range(3)], axis=-1
+    )
+    return np.where(broken[:, None], _unit(around), normals), int(broken.sum())
+
+
+def _insets(positions, normals, levels, nodes):
+    """Unit vectors (n, 3) from points on the rim toward the triangles they belong to, along the surface; 0 elsewhere."""
+    counts = node_count(levels[:, 0].astype(np.int64), levels[:, 1].astype(np.int64))
+    triangles = Patches(levels, np.cumsum(counts) - counts, nodes, np.zeros(0, np.int32)).triangles()
+    edges = np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1)
+    keys, uses = np.unique(edges[:, 0].astype(np.int64) * len(positions) + edges[:, 1], return_counts=True)
+    rim = np.zeros(len(positions), bool)
+    rim[np.concatenate(np.divmod(keys[uses == 1], len(positions)))] = True
+    inward = np.zeros_like(positions)
+    centres = positions[triangles].mean(axis=1)
+    for corner in triangles.T:
+        for x in range(3):
+            inward[:, x] += np.bincount(corner, centres[:, x] - positions[corner, x], len(positions))
+    inward -= np.sum(inward * normals, axis=1, keepdims=True) * normals
+    return np.where(rim[:, None], _unit(inward), 0)
+
+
+def _is_sealed(positions, faces, sign):
+    """Whether every edge, welded by position, joins two faces of one sense, and the side of `sign` is outside."""
     welded = np.unique(positions, axis=0, return_inverse=True)[1].ravel()[faces]
-    edges = np.sort(np.concatenate([welded[:, [0, 1]], welded[:, [1, 2]], welded[:, [2, 0]]]), axis=1)
-    counts = np.unique(edges[:, 0] * (len(positions) + 1) + edges[:, 1], return_counts=True)[1]
-    return bool((counts == 2).all())
+    count = len(positions) + 1
+    edges = np.concatenate([welded[:, [0, 1]], welded[:, [1, 2]], welded[:, [2, 0]]])
+    forward, uses = np.unique(edges[:, 0] * count + edges[:, 1], return_counts=True)
+    backward = np.unique(edges[:, 1] * count + edges[:, 0])
+    if (uses != 1).any() or not np.array_equal(forward, backward):
+        return False
+    a, b, c = (positions[faces[:, i]].astype(np.float64) for i in range(3))
+    return bool(sign * np.sum(a * np.cross(b, c)) > 0)
 
 
 # --- analytic shapes ---------------------------------------------------------------------------------------------
@@ -245,13 +295,14 @@ def _tessellate_analytic(surface, levels):
         positions=world,
         normals=normals,
         geometric_normals=normals,
+        insets=_insets(world, normals, levels, identity),
         uv=uv,
         areas=areas,
         primitives=np.zeros(len(first), np.int64),
         local_positions=local,
         levels=levels,
         nodes=identity,
-        closed=surface.kind == "Sphere",
+        sealed=surface.kind == "Sphere" and not surface.shape.has_flipped_normals(),
         counts={"degenerate_faces": 0, "zero_normals": 0, "flipped_normals": 0},
     )
 
@@ -263,16 +314,18 @@ def _evaluate(surface, uv):
     cylinders and forgets `flip_normals` of spheres.
     """
     u, v = uv.T.astype(np.float64)
+    to_world = transform_of(surface.shape)
     if surface.kind == "Sphere":
         local = _on_circle(u, np.sin(np.pi * v), np.cos(np.pi * v))
         normals = local
     elif surface.kind == "Cylinder":
         local = _on_circle(u, 1.0, v)
-        normals = _on_circle(u, 1.0, np.zeros_like(v))
+        # The normal is the product of tangents, so a mirroring transform turns it inside.
+        mirrored = np.linalg.det(to_world[:3, :3]) < 0
+        normals = (-1 if mirrored else 1) * _on_circle(u, 1.0, np.zeros_like(v))
     else:
         local = _on_circle(v, u, np.zeros_like(u))
         normals = np.broadcast_to([0.0, 0.0, 1.0], local.shape)
-    to_world = transform_of(surface.shape)
     normals = _unit(normals @ np.linalg.inv(to_world[:3, :3]))
     return _transformed(local, to_world), -normals if surface.shape.has_flipped_normals() else normals
 

@@ -86,11 +86,7 @@ def _plugin_class(variant):
         def sample(self, scene, sampler, ray, medium=None, active=True):
             if self._scene is not scene:
                 self._prepare(scene)
-            if self.hide_emitters:
-                pi = self.skip_area_emitters(scene, ray, True, active)
-            else:
-                pi = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
-            si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
+            pi, si = self._first_hit(scene, mi.Ray3f(ray), mi.Bool(active))
             hit = active & si.is_valid()
 
             # --- light that the surface reflects
@@ -111,6 +107,30 @@ def _plugin_class(variant):
                 radiance += dr.select(active, emitter.eval(si, active), 0)
             shown = hit if self.hide_emitters or scene.environment() is None else active
             return radiance, shown & visible, []
+
+        def _first_hit(self, scene, ray, active):
+            """The first intersection; with hide_emitters the first that is no area light.
+
+            Mitsuba's own `skip_area_emitters` measures distances from the last light it passed, which puts hits on
+            analytic shapes elsewhere.
+            """
+
+            def trace(ray, active):
+                pi = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
+                si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
+                return pi, si, active & si.is_valid() & si.shape.is_emitter()
+
+            pi, si, lamp = trace(ray, active)
+            if not self.hide_emitters:
+                return pi, si
+
+            def pass_through(ray, pi, si, lamp):
+                ray = dr.select(lamp, si.spawn_ray(ray.d), ray)
+                behind, surface, another = trace(ray, lamp)
+                return ray, dr.select(lamp, behind, pi), dr.select(lamp, surface, si), another
+
+            _, pi, si, _ = dr.while_loop((ray, pi, si, lamp), lambda ray, pi, si, lamp: lamp, pass_through)
+            return pi, si
 
         def _albedo(self, si, active):
             """Diffuse reflectance at hits, from the modelled material of each surface."""

@@ -1,6 +1,7 @@
 """Opening Mitsuba scenes and listing the surfaces in them."""
 
 import hashlib
+import os
 import re
 from collections import Counter
 from dataclasses import dataclass, field
@@ -67,6 +68,8 @@ class Surface:
         """Kind and place of an analytic shape as text, the same each time the scene is loaded; '' for meshes."""
         if self.kind == "mesh":
             return ""
+        if "to_world" not in mitsuba().traverse(self.shape):
+            return f"{self.kind} {self.shape.bbox()}"
         place = self.to_world @ transform_of(self.shape)
         flipped = " flipped" if self.shape.has_flipped_normals() else ""
         return self.kind + flipped + " " + " ".join(f"{x:.6g}" for x in place[:3].ravel() + 0.0)
@@ -124,12 +127,8 @@ class Scene:
 
     @cached_property
     def scale(self):
-        """Length that offsets and tolerances are measured by: the bounding box's diagonal or the largest coordinate."""
-        box = self.mi_scene.bbox()
-        low, high = np.array(box.min, dtype=np.float64).ravel(), np.array(box.max, dtype=np.float64).ravel()
-        if not np.isfinite([low, high]).all():
-            raise SceneError(f"the scene's bounding box {low}…{high} is not finite: a mesh holds NaN or infinite positions")
-        return float(max(np.linalg.norm(high - low), np.abs([low, high]).max()))
+        """See `scale_of`."""
+        return scale_of(self.mi_scene)
 
     @cached_property
     def occluders(self):
@@ -137,10 +136,7 @@ class Scene:
 
         Embree's robust mode is off in scenes by default; rays that start at vertices then leak through shared edges.
         """
-        shapes = {f"shape{i}": c for i, (_, c) in enumerate(self._children) if isinstance(c, mitsuba().Shape)}
-        return mitsuba().load_dict(
-            {"type": "scene", "embree_use_robust_intersections": True, **shapes}, optimize=False, parallel=False
-        )
+        return rebuilt_scene([c for _, c in self._children if isinstance(c, mitsuba().Shape)])
 
     @cached_property
     def hash(self):
@@ -151,6 +147,7 @@ class Scene:
             digest.update(surface.signature.encode())
             digest.update(surface.to_world.tobytes())
             if surface.kind == "mesh":
+                digest.update(str(surface.shape.has_flipped_normals()).encode())
                 for values in mesh_arrays(surface.shape)[:3]:
                     digest.update(b"-" if values is None else values.tobytes())
         return digest.hexdigest()
@@ -182,9 +179,9 @@ class Scene:
         changed = [i for i, s in enumerate(self.surfaces) if s.material.left_out]
         if not changed and not self.local_emitters:
             return self.mi_scene
-        if self.source.kind == "object":
+        if self.source.kind == "object" or _holds_objects(self.source.content):
             raise SceneError(
-                "a scene given as an mi.Scene cannot be rebuilt with diffuse materials and without local emitters: "
+                "a scene given as Mitsuba objects cannot be rebuilt with diffuse materials and without local emitters: "
                 "pass its path or dict, or compare with reference 'full'"
             )
         copy = open_scene(self.source.path or self.source.content, self.source.parameters)
@@ -223,6 +220,8 @@ def open_scene(source, parameters=None):
     if isinstance(source, dict):
         loaded = _loaded("the scene dict", mi.load_dict, source)
         return Scene(loaded, SceneSource("dict", content=source))
+    if not isinstance(source, str | os.PathLike):
+        raise SceneError(f"a scene is a path, a dict or an mi.Scene, got {type(source).__name__}")
     path = Path(source).absolute()
     if not path.is_file():
         raise SceneError(f"scene '{path}' does not exist")
@@ -239,6 +238,46 @@ def _loaded(what, load, *arguments, **parameters):
     if not isinstance(scene, mitsuba().Scene):
         raise SceneError(f"{what} is a {type(scene).__name__}, not a scene")
     return scene
+
+
+def rebuilt_scene(parts, additions=None):
+    """A new mi.Scene with watertight intersections, of objects of another and of plugin dicts.
+
+    Parameters
+    ----------
+    parts : list of mi.Object
+        They keep their ids (Mitsuba renames what it is given by the keys of the dict).
+    additions : dict, optional
+        Entries of a scene dict.
+
+    Returns
+    -------
+    mi.Scene
+    """
+    ids = [part.id() for part in parts]
+    entries = {f"part{i}": part for i, part in enumerate(parts)} | (additions or {})
+    try:
+        return mitsuba().load_dict(
+            {"type": "scene", "embree_use_robust_intersections": True, **entries}, optimize=False, parallel=False
+        )
+    finally:
+        for part, name in zip(parts, ids):
+            part.set_id(name)
+
+
+def scale_of(mi_scene):
+    """Length that offsets and tolerances are measured by: the bounding box's diagonal or the largest coordinate.
+
+    Raises
+    ------
+    SceneError
+        If the bounding box is not finite.
+    """
+    box = mi_scene.bbox()
+    low, high = np.array(box.min, dtype=np.float64).ravel(), np.array(box.max, dtype=np.float64).ravel()
+    if not np.isfinite([low, high]).all():
+        raise SceneError(f"the scene's bounding box {low}…{high} is not finite: a mesh holds NaN or infinite positions")
+    return float(max(np.linalg.norm(high - low), np.abs([low, high]).max()))
 
 
 def mesh_arrays(mesh):
@@ -262,6 +301,13 @@ def mesh_arrays(mesh):
     if mesh.has_vertex_texcoords():
         uv = np.array(mesh.vertex_texcoords_buffer(), dtype=np.float32).reshape(-1, 2)
     return positions, faces, normals, uv
+
+
+def _holds_objects(content):
+    """Whether a scene dict contains loaded objects, which a second scene of it would share."""
+    if isinstance(content, dict):
+        return any(_holds_objects(entry) for entry in content.values())
+    return isinstance(content, mitsuba().Object)
 
 
 def _name(shape, index):

@@ -124,9 +124,9 @@ class VisibilityTracer:
         mi = mitsuba()
         self.occluders = scene.occluders
         self.lanes_per_point = len(vectors)
-        # Rays start on the side of the surface that reflects. One that dips below the faces around its vertex (the
+        # Rays start on the side of the surface that reflects, and off its rim. One that dips below the faces around its vertex (the
         # hemisphere of a smooth normal can) runs into them and is blocked, as it is in Mitsuba's own rendering.
-        origins = points.positions + np.float32(RAY_OFFSET * scene.scale) * points.geometric_normals
+        origins = points.ray_origins(RAY_OFFSET * scene.scale)
         self._vectors, self._origins, self._normals = (
             mi.Float(np.pad(x, ((0, 0), (0, 1))).ravel())  # 4 floats each: gathered in one load
             for x in (vectors, origins, points.normals)
@@ -207,7 +207,7 @@ def find_buried(scene, points, dark):
         normals = np.repeat(points.normals[chunk], BURIED_RAYS, axis=0)
         toward = np.tile(vectors, (len(chunk), 1))
         toward *= np.where(np.sum(toward * normals, axis=1) < 0, -1, 1)[:, None].astype(np.float32)
-        origins = points.positions[chunk] + RAY_OFFSET * scene.scale * points.geometric_normals[chunk]
+        origins = points.at(chunk).ray_origins(RAY_OFFSET * scene.scale)
         ray = mi.Ray3f(mi.Point3f(np.repeat(origins, BURIED_RAYS, axis=0).T), mi.Vector3f(toward.T))
         hit = scene.occluders.ray_intersect(ray)
         inside = hit.is_valid() & ((dr.dot(hit.n, ray.d) > 0) | (hit.t < 1e-3 * scene.scale))
