@@ -85,7 +85,8 @@ class Asset:
         coefficients : (d, 3) float32
         mean_response : (3,) float32
         """
-        return self.basis.project_light(cell_radiance(light, self.directions))
+        with one_blas_thread():
+            return self.basis.project_light(cell_radiance(light, self.directions))
 
     def prepare_light(self, light):
         """The same light kept on a fine lattice, so that turning and projecting it takes milliseconds.

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..directions import Cubemap
+from ..parallel import one_blas_thread
 from .cells import cell_radiance
 from .environment import rotation_matrix
 from .light import DistantLight, as_light
@@ -40,7 +41,8 @@ class LatticeMap:
 
     def quadrature(self, spacing):
         """The cells as samples that cover the sphere, in one band; see `EnvironmentMap.quadrature`."""
-        vectors = self.directions.vectors @ self.rotation.T.astype(np.float32)
+        with one_blas_thread():
+            vectors = self.directions.vectors @ self.rotation.T.astype(np.float32)
         yield vectors, self.directions.solid_angles.astype(np.float32), self.radiance
 
 
