@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 
-import mi_prt
 from mi_prt.evaluate import metrics
 from mi_prt.evaluate.ground_truth import point_irradiance
 from mi_prt.lighting.scene_light import lit_scene, scene_light

@@ -117,7 +117,7 @@ def precompute(
     check_writable(output)
     _set_threads(threads)
     started = time.perf_counter()
-    with _progress(as_json) as progress:
+    with _progress() as progress:
         asset, cost = measure(
             scene,
             _parameters(define),
@@ -191,7 +191,7 @@ def compare(
 
     _set_threads(threads)
     asset = load(asset_path)
-    with _progress(as_json) as progress:
+    with _progress() as progress:
         result = run(
             asset,
             output,
@@ -325,7 +325,7 @@ def _plain(entry):
 
 
 @contextmanager
-def _progress(quiet=False):
+def _progress():
     """A callable(stage, done, total) that draws progress with ETA on stderr."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn

@@ -15,7 +15,6 @@ import mi_prt
 import mi_prt.transport.direct
 from conftest import bias, cube, diffuse, disk, rectangle, relative_l2, scene, sphere, uniform_sky
 from mi_prt import AssetError, SettingsError
-from mi_prt.asset import Asset
 from mi_prt.basis.pca import EXACT_SIDE, fit_pca
 from mi_prt.directions import Cubemap
 from mi_prt.lighting.cells import cell_radiance

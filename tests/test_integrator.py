@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import mi_prt
-from conftest import bias, cube, diffuse, disk, facing, rectangle, relative_l2, scene, sphere, uniform_sky
+from conftest import bias, cube, diffuse, disk, facing, rectangle, relative_l2, sphere, uniform_sky
 from mi_prt import AssetError, LightError, SceneError
 from mi_prt.render.integrator import integrator_for
 from mi_prt.runtime import mitsuba
@@ -388,6 +388,17 @@ def test_other_geometry_is_refused(path):
     integrator = mi.load_dict({"type": "prt", "filename": str(path)})
     for changes in (dict(ball=sphere((0, 0.6, 0), 0.5)), dict(more=cube((1, 0.2, 1), 0.2)), dict(floor=rectangle(size=2.1))):
         refused(SceneError, "precompute it again", render, mi.load_dict(still_life(**changes)), integrator, 1)
+
+
+@pytest.mark.parametrize("key", ["ball.to_world", "floor.to_world"])
+def test_geometry_edited_between_renders_is_refused(path, key):
+    """The stored transport is no longer that of the scene: an error, not an image that looks right."""
+    lit, integrator = mi.load_dict(still_life(), optimize=False), mi.load_dict({"type": "prt", "filename": str(path)})
+    render(lit, integrator, 1)
+    parameters = mi.traverse(lit)
+    parameters[key] = mi.Transform4f().translate([0, 0.1, 0]) @ parameters[key]
+    parameters.update()
+    refused(SceneError, "precompute it again", render, lit, integrator, 1)
 
 
 def test_one_integrator_renders_several_scenes(path):

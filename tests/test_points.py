@@ -433,6 +433,7 @@ def test_changed_geometry_is_refused_by_name():
         ("floor", dict(floor=rectangle(position=(0, 1e-3, 0), id="floor"))),
         ("ball", dict(ball=sphere((0, 1, 1e-3), 0.5, id="ball"))),
         ("ball", dict(ball=sphere((0, 1, 0), 0.5, id="ball", flip_normals=True))),
+        ("floor", dict(floor=rectangle(id="floor", flip_normals=True))),
         ("more", dict(more=cube(id="more"))),
     ]:
         with pytest.raises(SceneError, match=name) as caught:

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from conftest import diffuse, disk, emitted, facing, rectangle, scene, sky_of, sphere
+from conftest import diffuse, disk, emitted, rectangle, scene, sky_of, sphere
 
 import mi_prt
 from mi_prt.errors import SceneError, SettingsError

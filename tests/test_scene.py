@@ -294,7 +294,7 @@ def test_objects_inside_of_a_scene_dict_stay_as_they_are():
 
 def values_of(mi_scene):
     parameters = mi.traverse(mi_scene)
-    return {key: np.array(parameters[key].matrix if hasattr(parameters[key], "matrix") else parameters[key]) for key in parameters.keys()}
+    return {key: np.array(parameters[key].matrix if hasattr(parameters[key], "matrix") else parameters[key]) for key in parameters.keys()}  # noqa: SIM118  (iteration yields pairs)
 
 
 def test_a_loaded_scene_is_untouched_by_precompute():
