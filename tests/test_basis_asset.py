@@ -10,6 +10,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+import threadpoolctl
 
 import mi_prt
 import mi_prt.transport.direct
@@ -25,7 +26,9 @@ from mi_prt.transport.direct import sample_direct
 
 mi = mitsuba()
 
-SMALL = dict(floor=rectangle(size=2, bsdf=diffuse(0.6)), box=cube((0.2, 0.4, 0), 0.4), ball=disk((0, 1, 0.1), (0.3, 1.5, 0), 0.6))
+SMALL = dict(
+    floor=rectangle(size=2, bsdf=diffuse(0.6)), box=cube((0.2, 0.4, 0), 0.4), ball=disk((0, 1, 0.1), (0.3, 1.5, 0), 0.6)
+)
 
 
 def precompute(parts=SMALL, directions="cubemap:8", edge_length=0.8, **settings):
@@ -62,14 +65,21 @@ def fit(matrix, weights, components, index=None, **seed):
 
 
 def svd(matrix, weights):
-    """Squared singular values and right vectors of the centred matrix in the √w-weighted space, in float64."""
+    """Squared singular values and right vectors of the centred matrix in the √w-weighted space, in float64.
+
+    One thread: a threaded BLAS stalls where other programs run.
+    """
     weighted = (matrix - matrix.mean(axis=0, dtype=np.float64)) * np.sqrt(weights)
-    _, values, vectors = np.linalg.svd(weighted, full_matrices=False)
-    return weighted, values**2, vectors
+    with threadpoolctl.threadpool_limits(1, "blas"):
+        if min(matrix.shape) <= 300:
+            _, values, vectors = np.linalg.svd(weighted, full_matrices=False)
+            return weighted, values**2, vectors
+        gram = weighted.T @ weighted if len(weighted) > len(weights) else weighted @ weighted.T
+        return weighted, np.linalg.eigvalsh(gram)[::-1], None  # a tenth of the time
 
 
 EXACT = [(60, 40, None), (40, 60, None), (300, 900, 30), (900, 300, 30)]
-ITERATED = [(2400, 900, 40), (900, 2400, 40), (3000, 800, None)]
+ITERATED = [(2400, 900, 40), (900, 1800, 40), (3000, 800, None)]
 
 
 @pytest.mark.parametrize(("n", "s", "rank"), EXACT + ITERATED)
@@ -121,8 +131,7 @@ def test_rows_that_repeat_in_the_order_of_points_are_not_missed(every):
     matrix *= blockers @ lattice.vectors.T > rng.standard_normal((6000, 1))
     matrix[::every] = matrix[0]
     basis = fit(matrix.astype(np.float32), lattice.solid_angles, 48)
-    weighted = (matrix - matrix.mean(axis=0)) * np.sqrt(lattice.solid_angles)
-    squares = np.linalg.eigvalsh(weighted.T @ weighted)[::-1]
+    _, squares, _ = svd(matrix, lattice.solid_angles)
     assert squares[:48].sum() / squares.sum() - basis.captured_variance.sum() < 1e-3
 
 
@@ -172,7 +181,12 @@ def irradiances(matrix, weights, components, radiance):
     basis = fit(matrix, weights, components)
     coefficients = basis.encode(matrix)
     light, response = basis.project_light(radiance)
-    return basis, coefficients @ light + response, basis.paper_irradiance(coefficients, radiance), matrix @ (weights[:, None] * radiance)
+    return (
+        basis,
+        coefficients @ light + response,
+        basis.paper_irradiance(coefficients, radiance),
+        matrix @ (weights[:, None] * radiance),
+    )
 
 
 def test_the_papers_mean_compensation_agrees_where_the_mean_lies_in_the_span():
@@ -335,7 +349,9 @@ mi_prt.precompute(parts, directions="cubemap:8", edge_length=0.5).save(sys.argv[
 def test_the_same_seed_gives_the_same_file_in_two_processes(tmp_path):
     """Another hash seed and addresses; unnamed shapes, whose made-up ids hold an address."""
     running = [
-        subprocess.Popen([sys.executable, "-c", PROGRAM, str(tmp_path / f"{i}.prt")], env=os.environ | {"PYTHONHASHSEED": str(i)})
+        subprocess.Popen(
+            [sys.executable, "-c", PROGRAM, str(tmp_path / f"{i}.prt")], env=os.environ | {"PYTHONHASHSEED": str(i)}
+        )
         for i in (1, 2)
     ]
     assert [process.wait(120) for process in running] == [0, 0]
@@ -398,7 +414,10 @@ def test_foreign_and_incomplete_files_are_refused(saved, tmp_path):
         assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("name", ["coefficients", "basis/vectors", "points/positions", "points/buried", "basis/sqrt_weights", "points/patches/nodes"])
+@pytest.mark.parametrize(
+    "name",
+    ["coefficients", "basis/vectors", "points/positions", "points/buried", "basis/sqrt_weights", "points/patches/nodes"],
+)
 def test_arrays_that_do_not_fit_together_are_refused(saved, tmp_path, name):
     """A file with one array shorter than the others would fail later, or worse, not fail."""
 
@@ -414,7 +433,11 @@ def test_arrays_that_do_not_fit_together_are_refused(saved, tmp_path, name):
 # --- saving --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyboardInterrupt(), RuntimeError("HDF5 fails")], ids=lambda e: type(e).__name__)
+@pytest.mark.parametrize(
+    "error",
+    [OSError(28, "No space left on device"), KeyboardInterrupt(), RuntimeError("HDF5 fails")],
+    ids=lambda e: type(e).__name__,
+)
 def test_a_failing_write_leaves_the_old_file(asset, tmp_path, monkeypatch, error):
     """All or nothing: what was there stays, and no temporary file is left; what a full disk or HDF5 raises is a SettingsError."""
     path = tmp_path / "old.prt"
@@ -445,7 +468,9 @@ except mi_prt.SettingsError:
     print("refused")
 """
     (tmp_path / "old.prt").write_bytes(b"old")
-    ran = subprocess.run([sys.executable, "-c", code, str(saved), str(tmp_path / "old.prt")], capture_output=True, text=True, timeout=120)
+    ran = subprocess.run(
+        [sys.executable, "-c", code, str(saved), str(tmp_path / "old.prt")], capture_output=True, text=True, timeout=120
+    )
     assert (tmp_path / "old.prt").read_bytes() == b"old"
     assert (ran.returncode, ran.stdout.strip()) == (0, "refused"), ran.stderr[-2000:]
     assert os.listdir(tmp_path) == ["old.prt"]
@@ -455,7 +480,12 @@ def test_paths_that_cannot_be_written(asset, tmp_path):
     """A folder, a folder that is missing, a file in the place of a folder, a name longer than file systems take."""
     (tmp_path / "file").write_text("x")
     (tmp_path / "folder").mkdir()
-    for path in [tmp_path / "folder", tmp_path / "none" / "a.prt", tmp_path / "file" / "a.prt", tmp_path / ("x" * 300 + ".prt")]:
+    for path in [
+        tmp_path / "folder",
+        tmp_path / "none" / "a.prt",
+        tmp_path / "file" / "a.prt",
+        tmp_path / ("x" * 300 + ".prt"),
+    ]:
         with pytest.raises(SettingsError) as caught:
             asset.save(path)
         assert "\n" not in str(caught.value)

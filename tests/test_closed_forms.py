@@ -86,7 +86,9 @@ def test_unoccluded_plane_under_a_constant_sky(normal):
     asset = precompute(scene(plane=rectangle(normal)), edge_length=1.0)
     radiance = np.array([0.3, 1.0, 70.0])
     np.testing.assert_allclose(asset.irradiance(uniform_sky(radiance)) / (np.pi * radiance), 1, atol=1e-3)
-    np.testing.assert_allclose(asset.points.normals, np.broadcast_to(normal / np.linalg.norm(normal), (len(asset.points), 3)), atol=1e-6)
+    np.testing.assert_allclose(
+        asset.points.normals, np.broadcast_to(normal / np.linalg.norm(normal), (len(asset.points), 3)), atol=1e-6
+    )
 
 
 @pytest.mark.parametrize("radius", [1e-3, 1e3])
@@ -112,10 +114,10 @@ def test_inside_of_a_closed_surface_is_dark():
 # --- light from half of the sky ------------------------------------------------------------------------------------
 
 HALVES = {
-    "x>0": (lambda d: (d[:, :1] > 0), np.pi / 2),
-    "z<0": (lambda d: (d[:, 2:] < 0), np.pi / 2),
-    "upper": (lambda d: (d[:, 1:2] > 0), np.pi),
-    "lower": (lambda d: (d[:, 1:2] < 0), 0.0),
+    "x>0": (lambda d: d[:, :1] > 0, np.pi / 2),
+    "z<0": (lambda d: d[:, 2:] < 0, np.pi / 2),
+    "upper": (lambda d: d[:, 1:2] > 0, np.pi),
+    "lower": (lambda d: d[:, 1:2] < 0, 0.0),
 }
 
 
@@ -138,7 +140,9 @@ def test_half_sky_from_the_scenes_own_envmap_turned_with_the_plane(half):
         plane=rectangle(rotation[:, 1]),
         sky={"type": "envmap", "bitmap": mi.Bitmap(sky_of(function)), "to_world": matrix_transform(rotation), "scale": 3.0},
     )
-    np.testing.assert_allclose(under_own_light(parts, directions="cubemap:16", edge_length=1.0), 3 * expected, atol=0.02 * 3 * np.pi)
+    np.testing.assert_allclose(
+        under_own_light(parts, directions="cubemap:16", edge_length=1.0), 3 * expected, atol=0.02 * 3 * np.pi
+    )
 
 
 # --- a known occluder ----------------------------------------------------------------------------------------------
@@ -201,7 +205,11 @@ def test_transport_of_clutter_integrates_to_what_random_rays_find(clutter):
     assert np.abs(z).max() < scipy.stats.norm.isf(1e-4 / 2 / len(z))
     partly = (p > 0.02) & (p < 0.98)
     assert partly.sum() > 200
-    assert scipy.stats.chi2.interval(1 - 1e-4, partly.sum())[0] < (z[partly] ** 2).sum() < scipy.stats.chi2.isf(5e-5, partly.sum())
+    assert (
+        scipy.stats.chi2.interval(1 - 1e-4, partly.sum())[0]
+        < (z[partly] ** 2).sum()
+        < scipy.stats.chi2.isf(5e-5, partly.sum())
+    )
     assert (share[seen == 0] < 5e-3).all() and (seen == 0).sum() > 3  # the floor inside the box
 
 
@@ -223,10 +231,16 @@ def test_directional_emitters_of_a_scene(coarse_plane):
     """E·cos θ within the cell's radius r: the light is moved to the centre of its cell, and |Δcos θ| ≤ r."""
     rng = np.random.default_rng(3)
     for toward in uniform_directions(rng, 8):
-        emitter = {"type": "directional", "direction": list(-toward), "irradiance": {"type": "rgb", "value": [1.0, 2.0, 4.0]}}
+        emitter = {
+            "type": "directional",
+            "direction": list(-toward),
+            "irradiance": {"type": "rgb", "value": [1.0, 2.0, 4.0]},
+        }
         light = scene_light(open_scene(scene(plane=rectangle(), sun=emitter)))
         expected = max(0, toward[1]) * np.array([1.0, 2.0, 4.0])
-        np.testing.assert_array_less(np.abs(coarse_plane.irradiance(light)[0] - expected), 1.001 * CELL_RADIUS * np.array([1.0, 2.0, 4.0]))
+        np.testing.assert_array_less(
+            np.abs(coarse_plane.irradiance(light)[0] - expected), 1.001 * CELL_RADIUS * np.array([1.0, 2.0, 4.0])
+        )
         turned = coarse_plane.irradiance(light.rotated(np.cross(toward, [0, 1, 0]), np.degrees(np.arccos(toward[1]))))
         np.testing.assert_allclose(turned[0], [1.0, 2.0, 4.0], rtol=CELL_RADIUS**2 / 2)  # now it comes from straight above
 
@@ -326,7 +340,9 @@ def test_superposition_and_sign(clutter):
 def test_radiance_is_albedo_over_pi_times_irradiance(coarse_plane):
     """B = ρ/π · E, a definition."""
     light = uniform_sky([1.0, 2.0, 3.0])
-    np.testing.assert_allclose(coarse_plane.relight(light), coarse_plane.irradiance(light) * np.array([0.2, 0.5, 0.8]) / np.pi, rtol=1e-5)
+    np.testing.assert_allclose(
+        coarse_plane.relight(light), coarse_plane.irradiance(light) * np.array([0.2, 0.5, 0.8]) / np.pi, rtol=1e-5
+    )
     np.testing.assert_allclose(coarse_plane.relight(light)[0], [0.2, 1.0, 2.4], rtol=0.01)
 
 
@@ -338,13 +354,19 @@ def test_albedo_of_textures_at_the_points(kind):
     """
     shape = rectangle((0.2, 1, 0.3))
     if kind == "vertex colours":
-        shape = mi.load_dict({"type": "cube", "bsdf": {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_color"}}})
+        shape = mi.load_dict(
+            {"type": "cube", "bsdf": {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_color"}}}
+        )
         corners = np.array(mi.traverse(shape)["vertex_positions"]).reshape(-1, 3)
         shape.add_attribute("vertex_color", 3, ((corners + 1) * [0.3, 0.4, 0.5]).ravel())
     else:
         pixels = np.random.default_rng(0).random((5, 7, 3)).astype(np.float32)
         texture = {"type": "bitmap", "bitmap": mi.Bitmap(pixels), "raw": True, "to_uv": mi.ScalarTransform3f().scale([2, 1])}
-        texture = {"type": "checkerboard", "to_uv": mi.ScalarTransform3f().scale([1.7, 1.3])} if kind == "checkerboard" else texture
+        texture = (
+            {"type": "checkerboard", "to_uv": mi.ScalarTransform3f().scale([1.7, 1.3])}
+            if kind == "checkerboard"
+            else texture
+        )
         shape["bsdf"] = {"type": "twosided", "nested": {"type": "diffuse", "reflectance": texture}}
     asset = precompute(scene(shape=shape), "cubemap:8", edge_length=0.4, coefficients=0)
     points = asset.points

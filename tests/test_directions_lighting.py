@@ -137,14 +137,29 @@ def test_subdivision(rays):
         widths = np.diff(edges) / 64
         aa, bb = a[1][None, :], a[0][:, None]
         density = widths[1] * widths[0] / (1 + aa**2 + bb**2) ** 1.5
-        mean = np.array([(aa * density / np.sqrt(1 + aa**2 + bb**2)).sum(), (bb * density / np.sqrt(1 + aa**2 + bb**2)).sum()])
+        mean = np.array(
+            [(aa * density / np.sqrt(1 + aa**2 + bb**2)).sum(), (bb * density / np.sqrt(1 + aa**2 + bb**2)).sum()]
+        )
         (cell,) = lattice.cells(np.array([[np.tan(np.pi / 4 * -0.25), np.tan(np.pi / 4 * -0.75), 1.0]]))
         ours = (fractions[cell, :, None] * vectors[cell]).sum(axis=0)[:2] * lattice.solid_angles[cell]
         np.testing.assert_allclose(ours, mean, rtol=1e-3)
 
 
 @pytest.mark.parametrize(
-    "text", ["cubemap", "cubemap:", "cubemap:0", "cubemap:-4", "cubemap:513", "cubemap:3.5", "cubemap:²", "sphere:32", "32", "", None]
+    "text",
+    [
+        "cubemap",
+        "cubemap:",
+        "cubemap:0",
+        "cubemap:-4",
+        "cubemap:513",
+        "cubemap:3.5",
+        "cubemap:²",
+        "sphere:32",
+        "32",
+        "",
+        None,
+    ],
 )
 def test_bad_lattice_names(text):
     with pytest.raises(SettingsError) as caught:
@@ -165,7 +180,9 @@ def test_energy_of_a_map_is_exact(shape, resolution):
     np.testing.assert_allclose(energy_of(light, Cubemap(resolution)), exact_energy(light.pixels), rtol=1e-4)
 
 
-@pytest.mark.parametrize(("shape", "row"), [((9, 16), 3), ((17, 34), 5), ((64, 128), 0), ((64, 128), 63), ((512, 1024), 200)])
+@pytest.mark.parametrize(
+    ("shape", "row"), [((9, 16), 3), ((17, 34), 5), ((64, 128), 0), ((64, 128), 63), ((512, 1024), 200)]
+)
 @pytest.mark.parametrize("resolution", [4, 32])
 def test_energy_of_a_sun_of_a_single_pixel_is_exact(shape, row, resolution):
     """A pixel of 1e5 in a sky of 1 is neither missed nor counted at its peak: 1e-4 as above, also at the poles."""
@@ -237,8 +254,13 @@ def test_quadrature_equals_mitsubas_envmap(seed):
     rng = np.random.default_rng(seed)
     pixels = rng.random((12, 24, 3)).astype(np.float32)
     rotation = random_rotation(rng)
-    emitter = mi.load_dict({"type": "envmap", "bitmap": mi.Bitmap(pixels), "to_world": matrix_transform(rotation), "scale": 0.7})
-    for light in (EnvironmentMap(pixels, rotation, scale=0.7), scene_light(open_scene(scene(s=sphere(), e=emitter))).maps[0]):
+    emitter = mi.load_dict(
+        {"type": "envmap", "bitmap": mi.Bitmap(pixels), "to_world": matrix_transform(rotation), "scale": 0.7}
+    )
+    for light in (
+        EnvironmentMap(pixels, rotation, scale=0.7),
+        scene_light(open_scene(scene(s=sphere(), e=emitter))).maps[0],
+    ):
         total = 0
         for vectors, solid_angles, radiance in light.quadrature(0.05, band=5000):
             seen = emitted(emitter, vectors)
@@ -358,7 +380,17 @@ def test_rotation_is_right_handed():
 
 @pytest.mark.parametrize(
     ("axis", "degrees"),
-    [((0, 0, 0), 10), ("w", 10), ((1, 0), 10), ((np.nan, 0, 1), 10), ("x", np.inf), ("x", np.nan), (("a", "b", "c"), 1), (None, 1), ("xy", 1)],
+    [
+        ((0, 0, 0), 10),
+        ("w", 10),
+        ((1, 0), 10),
+        ((np.nan, 0, 1), 10),
+        ("x", np.inf),
+        ("x", np.nan),
+        (("a", "b", "c"), 1),
+        (None, 1),
+        ("xy", 1),
+    ],
 )
 def test_bad_rotations(axis, degrees):
     with pytest.raises(LightError) as caught:
@@ -419,7 +451,9 @@ def test_arrays_of_the_wrong_shape(shape):
         EnvironmentMap(np.ones(shape))
 
 
-@pytest.mark.parametrize("source", [None, 5, [["a"]], {"a": 1}, np.array([[["x"] * 3]]), np.ones((2, 4, 3), complex), object()])
+@pytest.mark.parametrize(
+    "source", [None, 5, [["a"]], {"a": 1}, np.array([[["x"] * 3]]), np.ones((2, 4, 3), complex), object()]
+)
 def test_things_that_are_no_light(source):
     with pytest.raises(LightError) as caught:
         as_light(source)
@@ -436,7 +470,9 @@ def test_exr_files(tmp_path):
     pixels = np.random.default_rng(0).random((6, 12, 3)).astype(np.float32)
     write_exr(tmp_path / "rgb.exr", {"RGB": pixels})
     write_exr(tmp_path / "half.EXR", {name: pixels[..., i].astype(np.float16).copy() for i, name in enumerate("RGB")})
-    write_exr(tmp_path / "more.exr", {"RGBA": np.dstack([pixels, np.ones((6, 12), np.float32)]), "depth.Z": pixels[..., 0].copy()})
+    write_exr(
+        tmp_path / "more.exr", {"RGBA": np.dstack([pixels, np.ones((6, 12), np.float32)]), "depth.Z": pixels[..., 0].copy()}
+    )
     np.testing.assert_array_equal(EnvironmentMap(tmp_path / "rgb.exr").pixels, pixels)
     np.testing.assert_array_equal(EnvironmentMap(str(tmp_path / "half.EXR")).pixels, pixels.astype(np.float16))
     np.testing.assert_array_equal(EnvironmentMap(tmp_path / "more.exr").pixels, pixels)
@@ -474,7 +510,18 @@ def test_files_that_cannot_be_read(tmp_path):
     (tmp_path / "empty.exr").write_bytes(b"")
     (tmp_path / "cut.exr").write_bytes(whole[: len(whole) // 2])
     (tmp_path / "head.exr").write_bytes(whole[:40])
-    names = ["missing.exr", "missing.hdr", "folder.exr", "text.exr", "text.hdr", "text.png", "text.xyz", "empty.exr", "cut.exr", "head.exr"]
+    names = [
+        "missing.exr",
+        "missing.hdr",
+        "folder.exr",
+        "text.exr",
+        "text.hdr",
+        "text.png",
+        "text.xyz",
+        "empty.exr",
+        "cut.exr",
+        "head.exr",
+    ]
     for name in names:
         with pytest.raises(LightError, match=name) as caught:
             EnvironmentMap(tmp_path / name)
@@ -483,7 +530,14 @@ def test_files_that_cannot_be_read(tmp_path):
 
 @pytest.mark.parametrize(
     ("direction", "irradiance"),
-    [([0, 0, 0], [1, 1, 1]), ([np.nan, 0, 1], [1, 1, 1]), ([0, 1], [1, 1, 1]), ([0, 1, 0], [1, -1, 1]), ([0, 1, 0], [1, np.inf, 1]), ([0, 1, 0], 1.0)],
+    [
+        ([0, 0, 0], [1, 1, 1]),
+        ([np.nan, 0, 1], [1, 1, 1]),
+        ([0, 1], [1, 1, 1]),
+        ([0, 1, 0], [1, -1, 1]),
+        ([0, 1, 0], [1, np.inf, 1]),
+        ([0, 1, 0], 1.0),
+    ],
 )
 def test_bad_directional_lights(direction, irradiance):
     with pytest.raises(LightError):

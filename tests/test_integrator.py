@@ -20,7 +20,14 @@ def camera(origin=(0, 2.5, 5), target=(0, 0.3, 0), width=36, height=24, fov=35, 
         "type": "perspective",
         "fov": float(fov),
         "to_world": mi.ScalarTransform4f().look_at(list(map(float, origin)), list(map(float, target)), [0, 1, 0]),
-        "film": {"type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "box"}, "component_format": "float32", **film},
+        "film": {
+            "type": "hdrfilm",
+            "width": width,
+            "height": height,
+            "rfilter": {"type": "box"},
+            "component_format": "float32",
+            **film,
+        },
     }
 
 
@@ -87,7 +94,9 @@ def inner(mi_scene, sensor=0):
 def outer(mi_scene, sensor=0):
     """Pixels, and their neighbours, that see no surface."""
     empty = np.pad(coverage(mi_scene, sensor) == 0, 1, mode="edge")
-    return np.all([empty[i : i + empty.shape[0] - 2, j : j + empty.shape[1] - 2] for i in range(3) for j in range(3)], axis=0)
+    return np.all(
+        [empty[i : i + empty.shape[0] - 2, j : j + empty.shape[1] - 2] for i in range(3) for j in range(3)], axis=0
+    )
 
 
 def refused(error, match, function, *arguments):
@@ -159,7 +168,13 @@ def test_alpha_follows_mitsuba(path):
 
 def test_area_lights_are_shown_and_light_nothing():
     """The shape of an area light shows its emission, as in Mitsuba, on top of what it reflects; its light is left out."""
-    lamp = rectangle((0, 0, 1), (0, 1.4, -0.5), 0.5, bsdf=diffuse(0.0), emitter={"type": "area", "radiance": {"type": "rgb", "value": [5.0, 4.0, 3.0]}})
+    lamp = rectangle(
+        (0, 0, 1),
+        (0, 1.4, -0.5),
+        0.5,
+        bsdf=diffuse(0.0),
+        emitter={"type": "area", "radiance": {"type": "rgb", "value": [5.0, 4.0, 3.0]}},
+    )
     parts = still_life(lamp=lamp)
     lit = mi.load_dict(parts)
     asset = mi_prt.precompute(parts, directions="cubemap:8", edge_length=0.3)
@@ -233,7 +248,10 @@ def test_textures_keep_their_resolution(path):
 def test_materials_that_are_not_diffuse_show_their_diffuse_part():
     """A rough plastic is shown as its diffuse reflectance, a conductor black: as the diffuse scene renders in Mitsuba."""
     plastic = {"type": "roughplastic", "diffuse_reflectance": {"type": "rgb", "value": [0.7, 0.5, 0.3]}}
-    parts = still_life(floor=rectangle(size=2, bsdf={"type": "twosided", "b": plastic}), ball=sphere((0, 0.5, 0), 0.5, bsdf={"type": "roughconductor"}))
+    parts = still_life(
+        floor=rectangle(size=2, bsdf={"type": "twosided", "b": plastic}),
+        ball=sphere((0, 0.5, 0), 0.5, bsdf={"type": "roughconductor"}),
+    )
     asset = mi_prt.precompute(parts, directions="cubemap:16", edge_length=0.15)
     expected = mi.load_dict(still_life(ball=sphere((0, 0.5, 0), 0.5, bsdf=diffuse(0.0))))
     for optimize in (False, True):
@@ -296,11 +314,15 @@ def test_any_sensor_and_film(path):
     top = {"type": "orthographic", "to_world": mi.ScalarTransform4f().look_at([0, 4, 0.01], [0, 0, 0], [0, 1, 0]).scale(1.5),
            "film": {"type": "hdrfilm", "width": 40, "height": 40, "crop_offset_x": 8, "crop_offset_y": 4, "crop_width": 20, "crop_height": 30,
                     "rfilter": {"type": "gaussian"}}}  # fmt: skip
-    lit = mi.load_dict(still_life(top=top, lens={**camera(), "type": "thinlens", "aperture_radius": 0.05, "focus_distance": 5.0}))
+    lit = mi.load_dict(
+        still_life(top=top, lens={**camera(), "type": "thinlens", "aperture_radius": 0.05, "focus_distance": 5.0})
+    )
     integrator = mi.load_dict({"type": "prt", "filename": str(path)})
     for sensor, shape in [(0, (24, 36, 3)), (1, (30, 20, 3)), (2, (24, 36, 3))]:
         image = render(lit, integrator, 32, sensor=sensor)
-        reference = np.array(mi.render(lit, integrator=mi.load_dict({"type": "path", "max_depth": 2}), spp=256, sensor=sensor, seed=5))
+        reference = np.array(
+            mi.render(lit, integrator=mi.load_dict({"type": "path", "max_depth": 2}), spp=256, sensor=sensor, seed=5)
+        )
         assert image.shape == shape
         compared(image, reference, 0.05)
 
@@ -318,7 +340,11 @@ def test_buried_points_do_not_darken_their_neighbours():
     Corners of those triangles lie below the slab, where it is black; their share goes to the other corners. Seen from above,
     with the share left where it was, the error is 7 % and the floor 3 % too dark.
     """
-    slab = {"type": "cube", "to_world": mi.ScalarTransform4f().translate([0.07, 0.03, 0.03]).scale([0.6, 0.03, 0.6]), "bsdf": diffuse(0.5)}
+    slab = {
+        "type": "cube",
+        "to_world": mi.ScalarTransform4f().translate([0.07, 0.03, 0.03]).scale([0.6, 0.03, 0.6]),
+        "bsdf": diffuse(0.5),
+    }
     above = camera(width=32, height=32) | {"type": "orthographic"}
     above["to_world"] = mi.ScalarTransform4f().look_at([0.07, 4, 0.03], [0.07, 0, 0.03], [0, 0, 1]).scale(0.96)
     del above["fov"]
@@ -451,7 +477,9 @@ def test_rendering_is_deterministic(path):
 def test_light_of_a_relit_asset_and_of_the_image_are_the_same(asset):
     """The image's pixel on the plane is B = ρ/π · E interpolated from `relight` at the points around."""
     far = camera(origin=(1.5, 3, 1.5), target=(1.5, 0, 1.4999), width=1, height=1, fov=0.2)
-    lit = mi.load_dict(still_life(camera=far | {"to_world": mi.ScalarTransform4f().look_at([1.5, 3, 1.5], [1.5, 0, 1.5], [1, 0, 0])}))
+    lit = mi.load_dict(
+        still_life(camera=far | {"to_world": mi.ScalarTransform4f().look_at([1.5, 3, 1.5], [1.5, 0, 1.5], [1, 0, 0])})
+    )
     radiance = asset.relight(uniform_sky([0.8, 1.0, 1.3]))
     floor = np.flatnonzero(asset.points.surface == 0)
     distance = np.linalg.norm(asset.points.positions[floor] - [1.5, 0, 1.5], axis=1)

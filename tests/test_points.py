@@ -76,12 +76,19 @@ def bumpy(side=7, seed=0):
     n = np.arange(side * side).reshape(side, side)
     a, b, c, d = n[:-1, :-1].ravel(), n[:-1, 1:].ravel(), n[1:, 1:].ravel(), n[1:, :-1].ravel()
     faces = np.concatenate([np.stack([a, b, c], -1), np.stack([a, c, d], -1)])
-    return positions, faces[np.random.default_rng(seed).permutation(len(faces))], slope / np.linalg.norm(slope, axis=1)[:, None]
+    return (
+        positions,
+        faces[np.random.default_rng(seed).permutation(len(faces))],
+        slope / np.linalg.norm(slope, axis=1)[:, None],
+    )
 
 
 def group(*instances, **shapes):
     """A shape group and its instances, given by their transforms."""
-    made = {f"instance{i}": {"type": "instance", "to_world": t, "g": {"type": "ref", "id": "group"}} for i, t in enumerate(instances)}
+    made = {
+        f"instance{i}": {"type": "instance", "to_world": t, "g": {"type": "ref", "id": "group"}}
+        for i, t in enumerate(instances)
+    }
     return {"group": {"type": "shapegroup", **shapes}, **made}
 
 
@@ -97,7 +104,10 @@ SCENES = {
     "sphere tilted": lambda: (dict(a={"type": "sphere", "to_world": tilted((2, 2, 2))}), False),
     "sphere flipped": lambda: (dict(a=sphere(radius=0.7, flip_normals=True)), False),
     "sphere mirrored": lambda: (dict(a={"type": "sphere", "to_world": tilted((-1, 1, 1))}), False),
-    "cylinder": lambda: (dict(a={"type": "cylinder", "p0": [0.2, 0, -1], "p1": [0.5, 1, 1], "radius": 0.4, "bsdf": TWO_SIDED}), False),
+    "cylinder": lambda: (
+        dict(a={"type": "cylinder", "p0": [0.2, 0, -1], "p1": [0.5, 1, 1], "radius": 0.4, "bsdf": TWO_SIDED}),
+        False,
+    ),
     "cylinder flipped": lambda: (dict(a={"type": "cylinder", "to_world": tilted((1, 1, 3)), "flip_normals": True}), False),
     "cylinder mirrored": lambda: (dict(a={"type": "cylinder", "to_world": tilted((1, -1, 1))}), False),
     "disk": lambda: (dict(a={"type": "disk", "to_world": tilted((1, 2, 1)), "bsdf": TWO_SIDED}), False),
@@ -106,20 +116,34 @@ SCENES = {
     "mesh smooth": lambda: (dict(a=mesh(*bumpy())), True),
     "mesh faceted": lambda: (dict(a=mesh(*bumpy()[:2], bsdf=TWO_SIDED)), True),
     "instances": lambda: (
-        group(tilted(), transform().translate([3, 0, 1]).scale([0.5, 1, 2]), transform().translate([0, 4, 0]).scale([1, -1, 1]),
-              c=cube((0.5, 0, 0), 0.5), m=mesh(*bumpy(), name="m")) | dict(floor=rectangle(position=(0, -3, 0), size=5)),
+        group(
+            tilted(),
+            transform().translate([3, 0, 1]).scale([0.5, 1, 2]),
+            transform().translate([0, 4, 0]).scale([1, -1, 1]),
+            c=cube((0.5, 0, 0), 0.5),
+            m=mesh(*bumpy(), name="m"),
+        )
+        | dict(floor=rectangle(position=(0, -3, 0), size=5)),
         True,
     ),
     "instances of curved shapes": lambda: (
-        group(tilted(), transform().translate([4, 0, 1]).scale([0.5, 1, 2]), transform().translate([0, 5, 0]).scale([1, 1, -1]),
-              s=sphere((0, 2, 0)), d=disk((0, 1, 0.2), bsdf=TWO_SIDED), y={"type": "cylinder", "radius": 0.3, "p1": [0, 0, 0.8]}),
+        group(
+            tilted(),
+            transform().translate([4, 0, 1]).scale([0.5, 1, 2]),
+            transform().translate([0, 5, 0]).scale([1, 1, -1]),
+            s=sphere((0, 2, 0)),
+            d=disk((0, 1, 0.2), bsdf=TWO_SIDED),
+            y={"type": "cylinder", "radius": 0.3, "p1": [0, 0, 0.8]},
+        ),
         False,
     ),
     "many": lambda: (
         dict(
-            floor=rectangle(size=3, bsdf={"type": "ref", "id": "grey"}), grey={"id": "grey", **diffuse()},
+            floor=rectangle(size=3, bsdf={"type": "ref", "id": "grey"}),
+            grey={"id": "grey", **diffuse()},
             wall=rectangle((0, 0, 1), (0, 1, -1), bsdf={"type": "ref", "id": "grey"}),
-            box=cube((1, 0.5, 0), 0.5, bsdf={"type": "ref", "id": "grey"}), ball=sphere((-1, 0.5, 0), 0.5),
+            box=cube((1, 0.5, 0), 0.5, bsdf={"type": "ref", "id": "grey"}),
+            ball=sphere((-1, 0.5, 0), 0.5),
         ),
         False,
     ),
@@ -149,8 +173,16 @@ def locate(wrapped, points, **seed):
     wi = np.array(si.to_world(si.wi)).T[valid]
     outside = (np.arange(len(valid)) % 4 > 0)[valid]  # see `hits`
     return dict(
-        outside=outside, points=np.stack([pick(i) for i in indices], -1).astype(int), weights=np.stack([pick(w) for w in weights], -1),
-        found=pick(found), front=pick(si.wi.z) > 0, two_sided=two_sided, wi=wi, p=pick(si.p), normal=pick(si.sh_frame.n), n=pick(si.n),
+        outside=outside,
+        points=np.stack([pick(i) for i in indices], -1).astype(int),
+        weights=np.stack([pick(w) for w in weights], -1),
+        found=pick(found),
+        front=pick(si.wi.z) > 0,
+        two_sided=two_sided,
+        wi=wi,
+        p=pick(si.p),
+        normal=pick(si.sh_frame.n),
+        n=pick(si.n),
     )
 
 
@@ -255,7 +287,10 @@ def longest_edge(points):
 
 
 @pytest.mark.parametrize("length", [0.5, 0.11, 0.05])
-@pytest.mark.parametrize(("name", "slack"), [("cube", 1), ("rectangle", 1), ("mesh smooth", 1), ("sphere", 2**0.5), ("cylinder", 2**0.5), ("instances", 1)])
+@pytest.mark.parametrize(
+    ("name", "slack"),
+    [("cube", 1), ("rectangle", 1), ("mesh smooth", 1), ("sphere", 2**0.5), ("cylinder", 2**0.5), ("instances", 1)],
+)
 def test_edge_length_is_honoured(name, slack, length):
     """No edge of a small triangle is longer; in the lattices of curved shapes a cell's sides are not, its diagonal is."""
     points = sample_points(open_scene(scene(**SCENES[name]()[0])), length)
@@ -396,7 +431,9 @@ def test_a_mesh_without_area_is_refused_by_name():
 def test_a_mesh_with_an_unused_vertex_far_away():
     """A vertex that no face uses gets no point."""
     positions, faces, normals = bumpy()
-    points = sample_points(open_scene(scene(a=mesh(np.vstack([positions, [[9, 9, 9]]]), faces, np.vstack([normals, [[0, 0, 1]]])))), 10.0)
+    points = sample_points(
+        open_scene(scene(a=mesh(np.vstack([positions, [[9, 9, 9]]]), faces, np.vstack([normals, [[0, 0, 1]]])))), 10.0
+    )
     assert len(points) == len(positions)
 
 
@@ -446,7 +483,9 @@ def test_changed_geometry_is_refused_by_name():
 
 def test_floor_under_a_box_is_buried_and_nothing_else():
     """Points strictly inside the box's footprint are buried; those beside it, though darker, are not."""
-    parts = dict(floor=rectangle(size=2), box={"type": "cube", "to_world": transform().translate([0.13, 0.5, 0.21]).scale(0.5)})
+    parts = dict(
+        floor=rectangle(size=2), box={"type": "cube", "to_world": transform().translate([0.13, 0.5, 0.21]).scale(0.5)}
+    )
     asset = mi_prt.precompute(scene(**parts), directions="cubemap:16", edge_length=0.3)
     points = asset.points
     inside = (np.abs(points.positions[:, [0, 2]] - [0.13, 0.21]) < 0.5 - 1e-4).all(axis=1)
@@ -469,13 +508,15 @@ def room(walls=6, rotation=np.eye(3), **rest):
     """The first `walls` walls of a closed room of half side 1, facing inwards; the last is the ceiling (+y)."""
     normals = [(0, 1, 0), (1, 0, 0), (-1, 0, 0), (0, 0, 1), (0, 0, -1), (0, -1, 0)][:walls]
     turn = matrix_transform(rotation)
-    return {f"wall{i}": {"type": "rectangle", "to_world": turn @ facing(n, -np.array(n)), **rest} for i, n in enumerate(normals)}
+    return {
+        f"wall{i}": {"type": "rectangle", "to_world": turn @ facing(n, -np.array(n)), **rest} for i, n in enumerate(normals)
+    }
 
 
 def test_a_dark_room_is_not_buried():
     """A closed room sees no sky, but its points see its walls from the front, far away: dark, not buried."""
     asset = mi_prt.precompute(scene(**room()), directions="cubemap:8", edge_length=0.5)
-    interior = (np.sort(np.abs(asset.points.positions), axis=1)[:, 1] < 1 - 1e-3)  # not on an edge
+    interior = np.sort(np.abs(asset.points.positions), axis=1)[:, 1] < 1 - 1e-3  # not on an edge
     assert not asset.buried[interior].any()
 
 

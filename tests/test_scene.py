@@ -172,7 +172,11 @@ MATERIALS = {
 def test_materials(name):
     """The diffuse part that a plugin's manual names is modelled, the rest is named, with the shape and a share in 0…1."""
     material, words, albedo, two_sided = MATERIALS[name]
-    asset = mi_prt.precompute(scene(thing=rectangle(bsdf=material(), id="thing"), other=disk(position=(0, 5, 0))), directions="cubemap:4", edge_length=1.0)
+    asset = mi_prt.precompute(
+        scene(thing=rectangle(bsdf=material(), id="thing"), other=disk(position=(0, 5, 0))),
+        directions="cubemap:4",
+        edge_length=1.0,
+    )
     on_thing = asset.points.surface == 0
     front = np.flatnonzero(on_thing)[: on_thing.sum() // (2 if two_sided else 1)]
     np.testing.assert_allclose(asset.points.albedo[front], np.broadcast_to(albedo, (len(front), 3)), atol=1e-5)
@@ -193,7 +197,10 @@ def test_the_share_that_is_left_out_is_that_of_the_light():
         "mirror": (mirror, 1.0),
         "blend": ({"type": "blendbsdf", "weight": 0.25, "a": diffuse(0.5), "b": mirror}, 0.25),
         "opaque": ({"type": "mask", "opacity": 1.0, "b": diffuse(0.5)}, 0.0),
-        "clear": ({"type": "mask", "opacity": 0.0, "b": diffuse(0.5)}, 0.5),  # all passes; half of it is modelled as reflected
+        "clear": (
+            {"type": "mask", "opacity": 0.0, "b": diffuse(0.5)},
+            0.5,
+        ),  # all passes; half of it is modelled as reflected
     }
     for name, (material, share) in materials.items():
         asset = mi_prt.precompute(scene(a=rectangle(bsdf=material)), directions="cubemap:4", edge_length=1.0)
@@ -234,7 +241,9 @@ def rendered(mi_scene, spp=64, seed=0):
         {"type": "perspective", "fov": 40, "to_world": mi.ScalarTransform4f().look_at([0, 3, 4], [0, 0.3, 0], [0, 1, 0]),
          "film": {"type": "hdrfilm", "width": 24, "height": 16, "rfilter": {"type": "box"}}}
     )  # fmt: skip
-    return np.array(mi.render(mi_scene, sensor=sensor, integrator=mi.load_dict({"type": "path", "max_depth": 2}), spp=spp, seed=seed))
+    return np.array(
+        mi.render(mi_scene, sensor=sensor, integrator=mi.load_dict({"type": "path", "max_depth": 2}), spp=spp, seed=seed)
+    )
 
 
 def stage(coat, **lights):
@@ -249,7 +258,13 @@ def test_the_modelled_scene_is_diffuse_and_without_local_light():
     """It renders as the scene written with diffuse materials and no lamps: equal but for noise, and without bias (1 %)."""
     lamps = dict(
         bulb={"type": "point", "position": [0, 2, 0], "intensity": {"type": "rgb", "value": 20.0}},
-        lamp=rectangle((0, -1, 0), (1, 1, 1), 0.3, emitter={"type": "area", "radiance": {"type": "rgb", "value": 9.0}}, bsdf=diffuse(0.0)),
+        lamp=rectangle(
+            (0, -1, 0),
+            (1, 1, 1),
+            0.3,
+            emitter={"type": "area", "radiance": {"type": "rgb", "value": 9.0}},
+            bsdf=diffuse(0.0),
+        ),
     )
     dark_lamp = {"lamp": lamps["lamp"].copy()}
     del dark_lamp["lamp"]["emitter"]
@@ -294,7 +309,10 @@ def test_objects_inside_of_a_scene_dict_stay_as_they_are():
 
 def values_of(mi_scene):
     parameters = mi.traverse(mi_scene)
-    return {key: np.array(parameters[key].matrix if hasattr(parameters[key], "matrix") else parameters[key]) for key in parameters.keys()}  # noqa: SIM118  (iteration yields pairs)
+    return {
+        key: np.array(parameters[key].matrix if hasattr(parameters[key], "matrix") else parameters[key])
+        for key in parameters.keys()
+    }  # noqa: SIM118  (iteration yields pairs)
 
 
 def test_a_loaded_scene_is_untouched_by_precompute():
@@ -375,6 +393,10 @@ def test_the_hash_of_faceted_and_instanced_shapes(tmp_path):
     assert len({*hashes, smooth}) == 3
     moved = []
     for x in (0, 1):
-        instance = {"type": "instance", "to_world": mi.ScalarTransform4f().translate([x, 0, 0]), "g": {"type": "ref", "id": "g"}}
+        instance = {
+            "type": "instance",
+            "to_world": mi.ScalarTransform4f().translate([x, 0, 0]),
+            "g": {"type": "ref", "id": "g"},
+        }
         moved.append(open_scene(scene(g={"type": "shapegroup", "s": sphere()}, i=instance)).hash)
     assert moved[0] != moved[1]

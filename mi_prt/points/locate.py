@@ -48,7 +48,7 @@ class PatchLocator:
         tables, starts, total = [], {}, 0
         for surface in scene.surfaces:
             if surface.kind == "mesh":
-                patch = faces.patches_of(surface)
+                patch = faces.take(surface)
             elif surface.kind in TESSELLATED_SHAPES:
                 patch = np.array([analytic.get(surface.signature, NO_PATCH)])
             else:
@@ -150,22 +150,29 @@ class _FaceIndex:
         keys = _corner_keys(points.positions[patches.nodes[corners]])
         order = np.argsort(keys)
         self._keys, self._patches = keys[order], is_triangle[order]
+        self._taken = np.zeros(len(keys), np.int64)  # at the first of equal keys: how many were given out
+        self._flipped = np.repeat([s["flipped"] for s in points.surfaces], [s["patches"] for s in points.surfaces])
 
-    def patches_of(self, surface):
-        """Patch (f,) of each face of a mesh; NO_PATCH where there is none. Faces of zero area match anything."""
+    def take(self, surface):
+        """Patch (f,) of each face of a mesh; NO_PATCH where there is none. Faces of zero area match anything.
+
+        Coincident faces have equal keys: the k-th of them in the scene takes the k-th of the points'.
+        """
         positions, faces, _, _ = mesh_arrays(surface.shape)
         world = (positions.astype(np.float64) @ surface.to_world[:3, :3].T + surface.to_world[:3, 3]).astype(np.float32)
         corners = world[faces]
         keys = _corner_keys(corners)
-        # Coincident faces have equal keys: the k-th of them in the scene takes the k-th of the points'.
         order = np.argsort(keys, kind="stable")
         ordered = keys[order]
         repeat = np.empty(len(keys), np.int64)
         repeat[order] = np.arange(len(keys)) - np.searchsorted(ordered, ordered)
         low, high = np.searchsorted(self._keys, keys), np.searchsorted(self._keys, keys, side="right")
-        place = np.minimum(low + repeat, np.maximum(high - 1, low))
         known = high > low
-        patch = np.where(known, self._patches[np.minimum(place, len(self._keys) - 1)] if len(self._keys) else 0, NO_PATCH)
+        patch = np.full(len(keys), NO_PATCH)
+        place = low[known] + repeat[known] + self._taken[low[known]]
+        patch[known] = self._patches[np.minimum(place, high[known] - 1)]
+        np.add.at(self._taken, low[known], 1)
+        patch[known] = np.where(self._flipped[patch[known]] == surface.shape.has_flipped_normals(), patch[known], NO_PATCH)
         doubled = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
         return np.where(~known & (doubled <= 1e-10 * max(doubled.max(initial=0.0), 1e-300)), 0, patch)
 

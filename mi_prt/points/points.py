@@ -35,7 +35,7 @@ class Points:
         Index into `surfaces`.
     patches : Patches
     surfaces : tuple of dict
-        name, kind, signature, first_patch and patches (their number) of each surface of the scene.
+        name, kind, signature, flipped, first_patch and patches (their number) of each surface of the scene.
     report : dict
         What was irregular: counts of degenerate faces, zero and flipped normals, back sides; edge length in metres.
     """
@@ -139,6 +139,7 @@ def _describe(surface, first_patch, patches):
         "name": surface.name,
         "kind": surface.kind,
         "signature": surface.signature,
+        "flipped": surface.shape.has_flipped_normals(),
         "first_patch": first_patch,
         "patches": patches,
     }

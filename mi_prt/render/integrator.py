@@ -68,15 +68,16 @@ def _plugin_class(variant):
             self._scene = self._light = self._irradiance = None
 
         def render(self, scene, sensor=0, *arguments, **named):
-            # Once for each image: emitters may have been edited since the last one, geometry may not.
             self._prepare(scene)
             return super().render(scene, sensor, *arguments, **named)
 
         def _prepare(self, scene):
-            if self._scene is not scene:
-                self._wrapped = Scene(scene, SceneSource("object", content=scene))
-                self._locator = PatchLocator(self._wrapped, self.asset.points)
-                self._scene = scene
+            """Once for each image: emitters and shapes may have been edited since the last one."""
+            opened = Scene(scene, SceneSource("object", content=scene))
+            if self._scene is not scene or self._wrapped.hash != opened.hash:
+                self._scene = None  # until the new one is known to fit
+                self._locator = PatchLocator(opened, self.asset.points)
+                self._wrapped, self._scene, self._light = opened, scene, None
             light = _fingerprint(self._wrapped.distant_emitters)
             if self._light != light:
                 irradiance = self.asset.irradiance(scene_light(self._wrapped))

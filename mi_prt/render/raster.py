@@ -320,7 +320,7 @@ def _emitted(surface, uv):
 def _is_baked(surface):
     """Whether a surface has textures over uv. For attributes of meshes, and on lights, the points' albedo must do."""
     modelled = surface.material.modelled
-    has_map = any(key.endswith("to_uv") for key in mitsuba().traverse(modelled))
+    has_map = any(key.endswith("to_uv") for key in mitsuba().traverse(modelled).keys())
     return has_map and "MeshAttribute" not in str(modelled) and surface.shape.emitter() is None
 
 
@@ -341,7 +341,7 @@ def _texels(bsdf, extent):
     """
     parameters = mitsuba().traverse(bsdf)
     wanted = [(1, 1)]
-    for key in parameters:
+    for key in parameters.keys():
         if key.endswith("to_uv"):
             data = key.removesuffix("to_uv") + "data"
             shape = parameters[data].shape[1::-1] if data in parameters else (PROCEDURAL_TEXELS, PROCEDURAL_TEXELS)

@@ -77,7 +77,7 @@ def model_material(bsdf):
     left_out = []
     modelled = _model(bsdf, left_out)
     two_sided = mi.has_flag(modelled.flags(), mi.BSDFFlags.BackSide)
-    textured = any(key.endswith((".data", "color0.value")) or "vertex_" in key for key in mi.traverse(modelled))
+    textured = any(key.endswith((".data", "color0.value")) or "vertex_" in key for key in mi.traverse(modelled).keys())
     textured = textured or mi.has_flag(modelled.flags(), mi.BSDFFlags.SpatiallyVarying)
     return Material(bsdf, modelled, two_sided, textured, tuple(dict.fromkeys(left_out)))
 

@@ -326,7 +326,7 @@ def _group_of(instance):
 
 def _darken(emitter):
     parameters = mitsuba().traverse(emitter)
-    for key in parameters:
+    for key in parameters.keys():  # SceneParameters iterates over pairs
         if key.split(".")[0] in ("radiance", "intensity", "irradiance", "sampling_weight") and "to_uv" not in key:
             parameters[key] = parameters[key] * 0
     parameters.update()
