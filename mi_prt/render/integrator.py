@@ -102,12 +102,10 @@ def _plugin_class(variant):
             radiance = dr.select(found, albedo * irradiance / dr.pi, 0)
 
             # --- light that is seen directly
-            visible = hit | ~mi.Bool(self.hide_emitters)
-            if not self.hide_emitters:
-                emitter = si.emitter(scene, active)
-                radiance += dr.select(active, emitter.eval(si, active), 0)
-            shown = hit if self.hide_emitters or scene.environment() is None else active
-            return radiance, shown & visible, []
+            if self.hide_emitters:
+                return radiance, hit, []
+            radiance += dr.select(active, si.emitter(scene, active).eval(si, active), 0)
+            return radiance, hit if scene.environment() is None else mi.Bool(active), []
 
         def _first_hit(self, scene, ray, active):
             """The first intersection; with hide_emitters the first that is no area light.
@@ -135,9 +133,8 @@ def _plugin_class(variant):
 
         def _albedo(self, si, active):
             """Diffuse reflectance at hits, from the modelled material of each surface."""
-            replaced = [s for s in self._wrapped.surfaces if s.material.modelled is not s.material.bsdf]
             bsdf = si.bsdf()
-            for material in {s.material for s in replaced}:
+            for material in dict.fromkeys(s.material for s in self._wrapped.surfaces if s.material.left_out):
                 bsdf = dr.select(bsdf == mi.BSDFPtr(material.bsdf), mi.BSDFPtr(material.modelled), bsdf)
             return bsdf.eval_diffuse_reflectance(si, active)
 
