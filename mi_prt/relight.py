@@ -5,8 +5,6 @@ from pathlib import Path
 
 from .errors import SettingsError
 from .files import check_writable
-from .lighting.cells import cell_radiance
-from .lighting.light import as_light
 from .lighting.scene_light import lit_scene, turned_light
 from .provenance import open_scene_of
 from .render.display import exposure
@@ -59,15 +57,12 @@ def relight_to_file(asset, output, light=None, rotate=None, scene=None, sensor=0
 
     needs_scene = suffix in IMAGES or light is None
     opened = open_scene_of(asset, scene) if needs_scene else None
-    if opened is None:
-        shown = cells_light = as_light(light) if rotate is None else as_light(light).rotated(*rotate)
-    else:
-        shown, cells_light = turned_light(opened, light, rotate)
+    shown, cells_light = turned_light(opened, light, rotate)
     if renderer == "raster":
         from .render.raster import RasterScene  # opens OpenGL: only where it is asked for
 
     clock = [time.perf_counter()]
-    projected = asset.basis.project_light(cell_radiance(cells_light, asset.directions))
+    projected = asset.project_light(cells_light)
     clock.append(time.perf_counter())
     irradiance = asset.irradiance_from(*projected)
     radiance = asset.outgoing_radiance(irradiance)

@@ -560,3 +560,13 @@ def test_a_mirrored_envmap_follows_mitsuba():
     emitter = mi.load_dict({"type": "envmap", "bitmap": mi.Bitmap(pixels), "to_world": matrix_transform(mirror)})
     directions = uniform_directions(rng, 300)
     assert relative_l2(interpolated(EnvironmentMap(pixels, mirror), directions), emitted(emitter, directions)) < 5e-3
+
+
+@pytest.mark.parametrize("pixel_format", ["RGB", "RGBA", "Y"])
+def test_a_mitsuba_bitmap_is_a_map(pixel_format):
+    """Its colour is taken as it is (linear), alpha left out, grey spread over the channels."""
+    rng = np.random.default_rng(1)
+    channels = {"RGB": 3, "RGBA": 4, "Y": 1}[pixel_format]
+    pixels = rng.random((4, 8, channels)).astype(np.float32)
+    light = EnvironmentMap(mi.Bitmap(pixels))
+    np.testing.assert_allclose(light.pixels, np.broadcast_to(pixels[..., :3], (4, 8, 3)), rtol=1e-6)

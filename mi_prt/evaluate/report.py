@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ..render.display import LUMINANCE, display
-from ..render.export import write_image
+from ..render.export import write_displayed, write_image
 from . import metrics
 
 _PAGE = """<!doctype html>
@@ -57,8 +57,8 @@ def write_report(folder, report, result, reference, covered):
     write_image(folder / "result.exr", result)
     write_image(folder / "reference.exr", reference)
     for name, picture in (("result", shown), ("reference", truth), ("error", error), ("flip", flip_map)):
-        _write_png(folder / f"{name}.png", picture)
-    _write_png(folder / "side_by_side.png", np.concatenate([shown, truth, error], axis=1))
+        write_displayed(folder / f"{name}.png", picture)
+    write_displayed(folder / "side_by_side.png", np.concatenate([shown, truth, error], axis=1))
     (folder / "report.json").write_text(json.dumps(finite(report), indent=2, allow_nan=False) + "\n")
     (folder / "index.html").write_text(_page(report))
 
@@ -82,12 +82,6 @@ def _coloured(values, colours):
     import matplotlib
 
     return matplotlib.colormaps[colours](np.clip(values, 0, 1))[..., :3].astype(np.float32)
-
-
-def _write_png(path, shown):
-    from PIL import Image
-
-    Image.fromarray(np.rint(np.clip(shown, 0, 1) * 255).astype(np.uint8)).save(path)
 
 
 def _page(report):

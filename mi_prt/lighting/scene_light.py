@@ -86,6 +86,13 @@ def lit_scene(mi_scene, light=None):
 def turned_light(scene, light=None, rotate=None):
     """The light to show a scene in.
 
+    Parameters
+    ----------
+    scene : Scene or None
+        Whose own light is taken where `light` is None; not needed otherwise.
+    light : what `as_light` accepts, optional
+    rotate : (axis, degrees), optional
+
     Returns
     -------
     shown : DistantLight or None
