@@ -14,18 +14,20 @@ _PAGE = """<!doctype html>
 <html lang="en"><meta charset="utf-8"><title>mi_prt comparison</title>
 <style>
 body {{ font: 16px/1.5 system-ui, sans-serif; max-width: 72rem; margin: 2rem auto; padding: 0 1rem; color: #222 }}
-figure {{ display: inline-block; margin: 0 1rem 1rem 0; vertical-align: top; max-width: 100% }}
+main {{ display: grid; grid-template-columns: 1fr 1fr; gap: 1rem }} figure {{ margin: 0 }}
 img {{ max-width: 100%; image-rendering: auto }}
 table {{ border-collapse: collapse; margin: 1rem 0 }} td, th {{ padding: .2rem 1rem .2rem 0; text-align: right }}
 th:first-child, td:first-child {{ text-align: left }} tr {{ border-bottom: 1px solid #ddd }}
 </style>
 <h1>{title}</h1>
 <p>{summary}</p>
+<main>
 <figure><img src="result.png" alt=""><figcaption>mi_prt</figcaption></figure>
 <figure><img src="reference.png" alt=""><figcaption>Mitsuba, {reference}</figcaption></figure>
 <figure><img src="error.png" alt=""><figcaption>Signed luminance error: blue darker, red brighter, full colour at
 &plusmn;{error_range:.0%} of the mean</figcaption></figure>
 <figure><img src="flip.png" alt=""><figcaption>FLIP: dark is equal to the eye, bright is different</figcaption></figure>
+</main>
 <table><tr><th></th><th>relative RMSE</th><th>beyond noise</th><th>bias</th><th>reference noise</th><th>PSNR</th><th>FLIP</th></tr>
 <tr><td>{count:,} points, irradiance</td>{points}<td></td><td></td></tr>
 <tr><td>image, radiance where geometry covers the pixel</td>{image}<td>{psnr:.1f} dB</td><td>{flip:.4f}</td></tr></table>
