@@ -24,6 +24,11 @@ row = asset.transport([0])  # (1, s): the first point's transport as the basis h
 print("mean irradiance", irradiance.mean(axis=0), "mean outgoing radiance", radiance.mean(axis=0))
 print("transport of point 0, integrated over the sphere:", float(row[0] @ asset.directions.solid_angles))
 
+# Several lights at once: a list is their sum. A local light is seen right from outside the scene's convex hull.
+sun = mi_prt.DirectionalLight(direction=[1, 0, -2], irradiance=3.0)  # travels down, W/m²
+lamp = mi_prt.PointLight(position=[1.5, -1.0, 2.0], intensity=[8, 6, 4])  # W/sr
+print("sky, sun and lamp:", asset.irradiance([light, sun, lamp]).mean(axis=0))
+
 # Turning light: prepared once, then milliseconds for each angle.
 prepared = asset.prepare_light(light)
 for degrees in (0, 90, 180, 270):

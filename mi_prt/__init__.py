@@ -25,7 +25,7 @@ from .errors import (  # noqa: E402
 )
 from .evaluate.compare import compare  # noqa: E402
 from .lighting.environment import EnvironmentMap, LightWarning  # noqa: E402
-from .lighting.light import DirectionalLight, DistantLight  # noqa: E402
+from .lighting.light import DirectionalLight, Light, PointLight  # noqa: E402
 from .precompute import precompute  # noqa: E402
 from .relight import relight_to_file  # noqa: E402
 from .render.integrator import register_integrator  # noqa: E402
@@ -35,11 +35,12 @@ __all__ = [
     "Asset",
     "AssetError",
     "DirectionalLight",
-    "DistantLight",
     "EnvironmentMap",
     "InputError",
+    "Light",
     "LightError",
     "LightWarning",
+    "PointLight",
     "PrtError",
     "RuntimeSetupError",
     "SceneError",

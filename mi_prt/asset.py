@@ -1,40 +1,21 @@
-"""The asset: everything that relighting needs, in one self-describing HDF5 file.
+"""The asset: everything that relighting needs."""
 
-The file is read with NumPy and h5py alone; docs/asset-format.md describes it field by field.
-"""
-
-import io
-import json
+import warnings
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
-from .basis.pca import PCA
-from .directions import parse_directions
-from .errors import AssetError
-from .files import replacing
+from . import asset_file
+from .basis.harmonics import HarmonicBasis, HarmonicLight
 from .lighting.cells import cell_radiance
+from .lighting.environment import LightWarning
 from .lighting.lattice import on_lattice
-from .parallel import one_blas_thread
-from .points.lattice import Patches, node_count
-from .points.points import POINT_FIELDS, Points
-
-FORMAT = "mi_prt asset"
-FORMAT_VERSION = 1
-UNITS = {
-    "points/positions": "m",
-    "points/areas": "m^2",
-    "points/albedo": "1, linear RGB reflectance",
-    "directions/solid_angles": "sr",
-    "basis/mean": "irradiance per unit radiance and steradian (1)",
-    "coefficients": "sr^(1/2)",
-    "irradiance": "W/m^2",
-    "outgoing radiance": "W/(m^2 sr)",
-}
-_PATCH_FIELDS = ("levels", "offsets", "nodes", "back")
-_BASIS_FIELDS = ("vectors", "mean", "sqrt_weights", "captured_variance")
+from .lighting.light import as_light
+from .lighting.local import arrival, hull_warning
+from .parallel import BLOCK_ROWS, map_chunks, one_blas_thread
+from .points.points import Points
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,16 +27,17 @@ class Asset:
     points : Points
     buried : (n,) bool
         Points inside or against other geometry; rendering takes their neighbours' light instead.
-    directions : Cubemap
-    basis : PCA
+    directions : DirectionLattice
+    basis : a basis of `basis.bases.BASES`
     coefficients : (n, d) float32
+        An array; a sparse array for the basis `haar`; the sampled `DirectTransport` (n, s) for the basis `none`.
     scene : dict
         kind, path, parameters, hash and left_out (what of the scene is not modelled).
     settings : dict
         What the run used.
     versions : dict
     report : dict
-        Counts from sampling: rays, dark and buried points, irregular geometry.
+        Counts from sampling (rays, dark and buried points), captured variance and relative error of the transport.
     path : Path or None
         The file it was loaded from or saved to.
     """
@@ -63,43 +45,81 @@ class Asset:
     points: Points
     buried: np.ndarray
     directions: object
-    basis: PCA
-    coefficients: np.ndarray
+    basis: object
+    coefficients: object
     scene: dict
     settings: dict
     versions: dict
     report: dict
     path: Path | None = field(default=None, compare=False)
 
-    # --- relighting ----------------------------------------------------------------------------------------------
+    # --- light ---------------------------------------------------------------------------------------------------
 
     def project_light(self, light):
         """Distant light in this asset's basis.
 
         Parameters
         ----------
-        light : EnvironmentMap, DistantLight, DirectionalLight, path, array (h, w, 3), or mi.Bitmap
+        light : Light, what `as_light` accepts, or what `prepare_light` returned
+            Local lights in it are left aside: at each point they are another light.
 
         Returns
         -------
         coefficients : (d, 3) float32
         mean_response : (3,) float32
         """
+        if isinstance(light, HarmonicLight):
+            return light.turned, np.zeros(3, np.float32)
         with one_blas_thread():
-            return self.basis.project_light(cell_radiance(light, self.directions))
+            return self.basis.project_light(cell_radiance(as_light(light).distant, self.directions))
 
     def prepare_light(self, light):
-        """The same light kept on a fine lattice, so that turning and projecting it takes milliseconds.
+        """The same light in a form that turns in milliseconds.
+
+        Spherical harmonics turn in closed form; for other bases the light is kept on a fine lattice.
 
         >>> sky = asset.prepare_light("sky.exr")
         >>> for degrees in range(360):
         ...     asset.relight(sky.rotated("y", degrees))
+
+        Parameters
+        ----------
+        light : Light or what `as_light` accepts
+
+        Returns
+        -------
+        Light or HarmonicLight
         """
+        light = as_light(light)
+        if isinstance(self.basis, HarmonicBasis):
+            return HarmonicLight(self.project_light(light)[0], points=light.points)
         return on_lattice(light, self.directions)
 
-    def irradiance(self, light):
-        """Irradiance at the points under distant light, (n, 3) float32 in W/m². See `project_light` for `light`."""
-        return self.irradiance_from(*self.project_light(light))
+    # --- relighting ----------------------------------------------------------------------------------------------
+
+    def irradiance(self, light, nearest=1):
+        """Irradiance at the points, (n, 3) float32 in W/m².
+
+        Parameters
+        ----------
+        light : Light, what `as_light` accepts, or what `prepare_light` returned
+            Any number of environment maps, directional and local lights; their irradiances add up.
+        nearest : int
+            Directions that stand for a local light (Eigentransport, section 4.2.1).
+
+        Warns
+        -----
+        LightWarning
+            If a local light is inside the convex hull of the scene: transport holds visibility to infinity.
+        """
+        light = light if isinstance(light, HarmonicLight) else as_light(light)
+        irradiance = self.irradiance_from(*self.project_light(light))
+        warning = hull_warning(light.points, self.points.positions)
+        if warning:
+            warnings.warn(warning, LightWarning, stacklevel=2)
+        for source in light.points:
+            irradiance += self._local_irradiance(source, nearest)
+        return irradiance
 
     def irradiance_from(self, coefficients, mean_response):
         """Irradiance (n, 3) from light that is projected already: c·ℓ + m (Eigentransport eq. 10, mean kept exactly).
@@ -111,9 +131,20 @@ class Asset:
         irradiance += mean_response
         return np.maximum(irradiance, 0, out=irradiance)
 
-    def relight(self, light):
-        """Outgoing radiance B = ρ/π · E at the points, (n, 3) float32 in W/(m²·sr). See `project_light` for `light`."""
-        return self.outgoing_radiance(self.irradiance(light))
+    def _local_irradiance(self, source, nearest):
+        """Irradiance (n, 3) by one local light: its directions' transport times I/r² (Eigentransport eq. 4, erratum 3)."""
+        cells, irradiance = arrival(source, self.points.positions, self.directions, nearest)
+
+        def transport(first):
+            block = slice(first, first + BLOCK_ROWS)
+            return self.basis.at(self.coefficients[block], cells[block]).mean(axis=1)
+
+        transport = np.concatenate(list(map_chunks(transport, range(0, len(self.points), BLOCK_ROWS))))
+        return irradiance * np.maximum(transport, 0)[:, None]
+
+    def relight(self, light, nearest=1):
+        """Outgoing radiance B = ρ/π · E at the points, (n, 3) float32 in W/(m²·sr). See `irradiance`."""
+        return self.outgoing_radiance(self.irradiance(light, nearest))
 
     def outgoing_radiance(self, irradiance):
         """Outgoing radiance B = ρ/π · E (n, 3) of irradiance (n, 3) at the points."""
@@ -130,45 +161,15 @@ class Asset:
     # --- file ----------------------------------------------------------------------------------------------------
 
     def save(self, path):
-        """Write the asset to one file, all or nothing.
+        """Write the asset to one file, all or nothing; see `asset_file`.
 
         Raises
         ------
         SettingsError
             If the path cannot be written.
         """
-        path = Path(path)
-        # HDF5 crashes where a disk is full; plain bytes raise.
-        content = io.BytesIO()
-        self._write(content)
-        with replacing(path) as temporary:
-            Path(temporary).write_bytes(content.getbuffer())
-        object.__setattr__(self, "path", path.absolute())
-
-    def _write(self, stream):
-        import h5py
-
-        with h5py.File(stream, "w") as file:
-            file.attrs["format"] = FORMAT
-            file.attrs["format_version"] = FORMAT_VERSION
-            for name in ("scene", "settings", "versions", "report"):
-                file.attrs[name] = json.dumps(getattr(self, name), sort_keys=True)
-            file.attrs["units"] = json.dumps(UNITS, sort_keys=True)
-            for name in POINT_FIELDS:
-                file[f"points/{name}"] = getattr(self.points, name)
-            file["points/buried"] = self.buried
-            file["points"].attrs["report"] = json.dumps(self.points.report, sort_keys=True)
-            file["points"].attrs["surfaces"] = json.dumps(self.points.surfaces, sort_keys=True)
-            for name in _PATCH_FIELDS:
-                file[f"points/patches/{name}"] = getattr(self.points.patches, name)
-            file["directions/vectors"] = self.directions.vectors
-            file["directions/solid_angles"] = self.directions.solid_angles
-            file["directions"].attrs["lattice"] = str(self.directions)
-            for name in _BASIS_FIELDS:
-                file[f"basis/{name}"] = getattr(self.basis, name)
-            file["basis"].attrs["kind"] = "pca"
-            file["coefficients"] = self.coefficients
-            file.attrs["complete"] = True
+        asset_file.write(self, path)
+        object.__setattr__(self, "path", Path(path).absolute())
 
 
 def load(path):
@@ -187,71 +188,4 @@ def load(path):
     AssetError
         If the file is missing, truncated, no asset, or of a format version this program does not know.
     """
-    import h5py
-
-    path = Path(path)
-    if not path.is_file():
-        raise AssetError(f"asset '{path}' does not exist")
-    try:
-        with h5py.File(path, "r") as file:
-            if file.attrs.get("format") != FORMAT:
-                raise AssetError(f"'{path}' is an HDF5 file but no mi_prt asset: make one with `mi-prt precompute`")
-            version = int(file.attrs["format_version"])
-            if version != FORMAT_VERSION:
-                raise AssetError(
-                    f"asset '{path}' has format version {version}, this program reads {FORMAT_VERSION}: precompute it again"
-                )
-            if not file.attrs.get("complete"):
-                raise AssetError(f"asset '{path}' is incomplete: precompute it again")
-            return _read(file, path)
-    except (OSError, KeyError, TypeError, ValueError) as error:
-        if isinstance(error, AssetError):
-            raise
-        reason = " ".join(str(error).split())
-        raise AssetError(f"'{path}' is truncated or no mi_prt asset ({reason})") from None
-
-
-def _read(file, path):
-    texts = {name: json.loads(file.attrs[name]) for name in ("scene", "settings", "versions", "report")}
-    points = file["points"]
-    asset = Asset(
-        points=Points(
-            **{name: points[name][()] for name in POINT_FIELDS},
-            patches=Patches(**{name: points[f"patches/{name}"][()] for name in _PATCH_FIELDS}),
-            surfaces=tuple(json.loads(points.attrs["surfaces"])),
-            report=json.loads(points.attrs["report"]),
-        ),
-        buried=points["buried"][()],
-        directions=parse_directions(file["directions"].attrs["lattice"]),
-        basis=PCA(**{name: file[f"basis/{name}"][()] for name in _BASIS_FIELDS}),
-        coefficients=file["coefficients"][()],
-        path=path.absolute(),
-        **texts,
-    )
-    _check_shapes(asset)
-    return asset
-
-
-def _check_shapes(asset):
-    """Raise ValueError unless the arrays of an asset fit together."""
-    n, s, d = len(asset.points), len(asset.directions), len(asset.basis.vectors)
-    patches = asset.points.patches
-    p = len(patches.levels)
-    expected = {
-        **{f"points/{name}": (getattr(asset.points, name), (n, 3)) for name in POINT_FIELDS[:5]},
-        "points/uv": (asset.points.uv, (n, 2)),
-        **{f"points/{name}": (getattr(asset.points, name), (n,)) for name in ("areas", "surface")},
-        "points/buried": (asset.buried, (n,)),
-        "points/patches/levels": (patches.levels, (p, 2)),
-        "points/patches/offsets": (patches.offsets, (p,)),
-        "points/patches/back": (patches.back, (p,)),
-        "points/patches/nodes": (patches.nodes, (int(node_count(*patches.levels.T.astype(np.int64)).sum()),)),
-        "basis/vectors": (asset.basis.vectors, (d, s)),
-        "basis/mean": (asset.basis.mean, (s,)),
-        "basis/sqrt_weights": (asset.basis.sqrt_weights, (s,)),
-        "basis/captured_variance": (asset.basis.captured_variance, (d,)),
-        "coefficients": (asset.coefficients, (n, d)),
-    }
-    for name, (array, shape) in expected.items():
-        if array.shape != shape:
-            raise ValueError(f"{name} is of shape {array.shape} instead of {shape}")
+    return Asset(**asset_file.read(path))

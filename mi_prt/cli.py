@@ -33,18 +33,36 @@ Define = Annotated[
 Environment = Annotated[
     Optional[Path], typer.Option("--envmap", metavar="EXR", help="Environment map; default: the scene's own light.")
 ]
+Lights = Annotated[
+    Optional[list[str]],
+    typer.Option(
+        "--light",
+        metavar="SPEC",
+        help="point:x,y,z:r,g,b (W/sr), directional:dx,dy,dz:r,g,b (direction of travel, W/m²), envmap:FILE or "
+        "envmap:FILE:y:30; one number is grey. May be repeated: lights add up, also to --envmap.",
+    ),
+]
+Nearest = Annotated[int, typer.Option("--nearest", metavar="K", help="Directions that stand for a local light.")]
 Rotate = Annotated[
-    Optional[str], typer.Option("--rotate", metavar="AXIS:DEGREES", help="Turn the light about x, y, z or a,b,c.")
+    Optional[str], typer.Option("--rotate", metavar="AXIS:DEGREES", help="Turn distant light about x, y, z or a,b,c.")
 ]
 OtherScene = Annotated[
     Optional[Path], typer.Option("--scene", metavar="SCENE", help="The asset's scene, if it is elsewhere by now.")
 ]
 Sensor = Annotated[int, typer.Option("--sensor", help="Index of the scene's sensor.")]
 Size = Annotated[Optional[str], typer.Option("--size", metavar="WxH", help="Image size; default: the sensor's.")]
-Directions = Annotated[str, typer.Option("--directions", metavar="cubemap:N", help="Lattice of 6·N·N directions.")]
+Directions = Annotated[
+    str, typer.Option("--directions", metavar="LATTICE", help="cubemap:N (6·N·N directions), latlong:WxH or halton:N.")
+]
+Basis = Annotated[
+    str, typer.Option("--basis", metavar="KIND", help="pca, sh, haar (best wavelets of each point), haar-shared or none.")
+]
 Coefficients = Annotated[
-    Optional[int],
-    typer.Option("--coefficients", metavar="D", help="Components of the basis; default: 48, or the rank if lower."),
+    Optional[str],
+    typer.Option("--coefficients", metavar="D|auto", help="Components of the basis; default: 48 (sh: 49), or the rank if lower."),
+]
+Variance = Annotated[
+    Optional[float], typer.Option("--variance", metavar="SHARE", help="Of the transport, that --coefficients auto captures [0.95].")
 ]
 EdgeLength = Annotated[
     str, typer.Option("--edge-length", metavar="auto|METRES", help="Coarse faces are tessellated down to this.")
@@ -72,7 +90,9 @@ def doctor(as_json: Json = False):
 def info(
     path: Annotated[Path, typer.Argument(help="A scene (XML) or an asset.")],
     directions: Directions = "cubemap:32",
+    basis: Basis = "pca",
     coefficients: Coefficients = None,
+    variance: Variance = None,
     edge_length: EdgeLength = "auto",
     rays_per_direction: Rays = 1,
     define: Define = None,
@@ -90,27 +110,42 @@ def info(
             path,
             _parameters(define),
             directions=directions,
-            coefficients=coefficients,
+            basis=basis,
+            coefficients=_count(coefficients),
+            variance=variance,
             edge_length=edge_length,
             rays_per_direction=rays_per_direction,
         )
     _print_json(found) if as_json else _print_nested(found)
 
 
-@app.command(epilog="Example: mi-prt precompute scenes/teapot.xml -o teapot.prt --coefficients 96 -D spp=16")
+@app.command(
+    epilog="Examples: mi-prt precompute scenes/teapot.xml -o teapot.prt --coefficients 96 -D spp=16; "
+    "mi-prt precompute scenes/teapot.xml -o teapot.prt --coefficients auto --variance 0.98 --max-memory 2G --resume"
+)
 def precompute(
     scene: Annotated[Path, typer.Argument(help="A Mitsuba XML file.")],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="The asset to write.")],
     directions: Directions = "cubemap:32",
+    basis: Basis = "pca",
     coefficients: Coefficients = None,
+    variance: Variance = None,
     edge_length: EdgeLength = "auto",
     rays_per_direction: Rays = 1,
     seed: Seed = 0,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue an interrupted run of this file, if there is one.")] = False,
+    max_memory: Annotated[
+        Optional[str], typer.Option("--max-memory", metavar="BYTES", help="Such as 3G; default: half of what is free.")
+    ] = None,
     threads: Threads = None,
     define: Define = None,
     as_json: Json = False,
 ):
-    """Precompute a scene's transport into one file."""
+    """Precompute a scene's transport into one file.
+
+    What is computed on the way is kept in FILE.partial until FILE is whole: a run that is interrupted or killed can be
+    continued with --resume, and gives the same file.
+    """
     from .files import check_writable
     from .precompute import measure
 
@@ -122,34 +157,42 @@ def precompute(
             scene,
             _parameters(define),
             progress,
+            output,
+            resume,
+            max_memory,
             directions=directions,
-            coefficients=coefficients,
+            basis=basis,
+            coefficients=_count(coefficients),
+            variance=variance,
             edge_length=edge_length,
             rays_per_direction=rays_per_direction,
             seed=seed,
         )
-    writing = time.perf_counter()
-    asset.save(output)
-    finished = time.perf_counter()
-    cost["seconds"] |= {"write": round(finished - writing, 4), "total": round(finished - started, 4)}
+    cost["seconds"]["total"] = round(time.perf_counter() - started, 4)
     for entry in asset.scene["left_out"]:
         _note(f"not modelled: {entry['what']}" + (f" ({', '.join(entry['shapes'][:5])})" if entry["shapes"] else ""))
     result = {
         "points": len(asset.points),
         "directions": len(asset.directions),
-        "coefficients": len(asset.basis.vectors),
+        "coefficients": len(asset.basis),
         "captured_variance": asset.report["captured_variance"],
+        "relative_error": asset.report["relative_error"],
         "bytes": output.stat().st_size,
         **cost,
     }
     _print_json(result) if as_json else _print_nested({"wrote": str(output)} | result)
 
 
-@app.command(epilog="Example: mi-prt relight teapot.prt -o teapot.png --envmap sky.exr --rotate y:90 --size 640x480")
+@app.command(
+    epilog="Examples: mi-prt relight teapot.prt -o teapot.png --envmap sky.exr --rotate y:90 --size 640x480\n\n"
+    "mi-prt relight teapot.prt -o lamps.png --light point:3,4,2:60,50,40 --light point:-3,4,2:20 --light envmap:sky.exr:y:90"
+)
 def relight(
     asset_path: Annotated[Path, typer.Argument(metavar="FILE", help="An asset.")],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="OUT", help=".exr, .png, .ply or .npz")],
     envmap: Environment = None,
+    light: Lights = None,
+    nearest: Nearest = 1,
     rotate: Rotate = None,
     sensor: Sensor = 0,
     size: Size = None,
@@ -164,8 +207,9 @@ def relight(
     from .relight import relight_to_file
 
     _set_threads(threads)
+    chosen = _light(envmap, light)
     result = relight_to_file(
-        load(asset_path), output, envmap, _rotation(rotate), scene, sensor, _size(size), renderer, spp
+        load(asset_path), output, chosen, _rotation(rotate), scene, sensor, _size(size), renderer, spp, nearest
     )
     _print_json(result) if as_json else _print_nested({"wrote": str(output)} | result)
 
@@ -175,6 +219,8 @@ def compare(
     asset_path: Annotated[Path, typer.Argument(metavar="FILE", help="An asset.")],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the report.")],
     envmap: Environment = None,
+    light: Lights = None,
+    nearest: Nearest = 1,
     rotate: Rotate = None,
     sensor: Sensor = 0,
     size: Size = None,
@@ -195,7 +241,7 @@ def compare(
         result = run(
             asset,
             output,
-            envmap,
+            _light(envmap, light),
             _rotation(rotate),
             scene,
             sensor,
@@ -204,6 +250,7 @@ def compare(
             reference,
             seed,
             progress,
+            nearest,
         )
     _print_json(result) if as_json else _print_nested({"wrote": str(output / "index.html")} | result)
 
@@ -221,10 +268,10 @@ def main(arguments=None):
         print(f"mi-prt: {error}", file=sys.stderr)
         sys.exit(error.exit_code)
     except KeyboardInterrupt:
-        print("mi-prt: interrupted; nothing was left half-written", file=sys.stderr)
+        print("mi-prt: interrupted; nothing was left half-written, and --resume continues a precomputation", file=sys.stderr)
         sys.exit(1)
     except MemoryError:
-        print("mi-prt: out of memory: use fewer --directions or a longer --edge-length", file=sys.stderr)
+        print("mi-prt: out of memory: use fewer --directions or a longer --edge-length, or set --max-memory", file=sys.stderr)
         sys.exit(1)
 
 
@@ -245,18 +292,27 @@ def _parameters(define):
     return parameters
 
 
-def _rotation(text):
-    if text is None:
-        return None
-    axis, colon, degrees = text.rpartition(":")
+def _count(text):
+    """Number of coefficients, 'auto' or None."""
+    if text in (None, "auto"):
+        return text
     try:
-        named = axis in ("x", "y", "z")
-        vector = axis if named else tuple(float(x) for x in axis.split(","))
-        if not colon or not (named or len(vector) == 3):
-            raise ValueError
-        return vector, float(degrees)
+        return int(text)
     except ValueError:
-        raise SettingsError(f"--rotate {text} is not of the form AXIS:DEGREES, for example y:30 or 0,1,1:30") from None
+        raise SettingsError(f"--coefficients {text} is neither a whole number nor auto") from None
+
+
+def _light(envmap, specs):
+    """The sum of --envmap and all --light; None if there is neither."""
+    from .lighting.parse import parse_light
+
+    return ([] if envmap is None else [envmap]) + [parse_light(spec) for spec in specs or []] or None
+
+
+def _rotation(text):
+    from .lighting.parse import parse_rotation
+
+    return None if text is None else parse_rotation(text)
 
 
 def _size(text):
@@ -330,13 +386,19 @@ def _progress():
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(elapsed_when_finished=True)
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(elapsed_when_finished=True),
+        TextColumn("{task.fields[detail]}"),
+    )
     tasks = {}
     with Progress(*columns, console=Console(stderr=True)) as bar:
 
-        def progress(stage, done, total):
+        def progress(stage, done, total, detail=""):
             if stage not in tasks:
-                tasks[stage] = bar.add_task(stage, total=total)
-            bar.update(tasks[stage], completed=done)
+                tasks[stage] = bar.add_task(stage, total=total, detail="")
+            bar.update(tasks[stage], completed=done, total=total, detail=detail)
 
         yield progress

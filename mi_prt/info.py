@@ -5,18 +5,20 @@ from dataclasses import asdict
 
 import numpy as np
 
-from .basis.pca import BLOCK_ROWS
+from .asset_file import coefficient_arrays
 from .directions import parse_directions
+from .parallel import BLOCK_ROWS
 from .points.points import POINT_BUDGET, sample_points
-from .precompute import DEFAULT_COEFFICIENTS, Settings
+from .precompute import LANE_BYTES, Settings, coefficient_bytes
 from .provenance import left_out
 from .runtime import peak_memory_bytes
 from .scene.scene import open_scene
 from .transport.direct import LANES, sample_direct
 
 PROBE_POINTS = 256
-# Work of the basis in passes over all rows: moments, the sample's iterations, the full one, Rayleigh–Ritz, encoding.
-BASIS_PASSES = 4.5
+AUTO_COEFFICIENTS = 64  # what `auto` is predicted with: how many it takes is known once it is fitted
+# Work of fitting and encoding, in passes over all rows that multiply them with a basis of that many components, and back.
+BASIS_PASSES = {"pca": 5.5, "sh": 1.5, "haar": 4.0, "haar-shared": 3.0, "none": 0.0}
 
 
 def describe(source, parameters=None, **settings):
@@ -44,15 +46,15 @@ def describe(source, parameters=None, **settings):
     points = sample_points(scene, settings.edge_length)
     sampling = time.perf_counter() - started
     directions = parse_directions(settings.directions)
-    coefficients = settings.coefficients
-    if coefficients is None:
-        coefficients = min(DEFAULT_COEFFICIENTS, len(points) - 1, len(directions))
+    target = settings.target(len(points))
+    coefficients = AUTO_COEFFICIENTS if target.components is None else target.components
     probe = _probe(scene, points, directions, settings, coefficients)
     n, s, rays = len(points), len(directions), settings.rays_per_direction
     transport = probe["rays"] * n / probe["rate"]
-    basis = probe["pass"] * n * BASIS_PASSES
-    stored = n * (4 * coefficients + 60) + s * 4 * (coefficients + 6) + 4 * len(points.patches.nodes)
-    working = n * s * rays // 16 + LANES * 30 + 40 * s * (coefficients + 16) + stored
+    basis = probe["pass"] * n * BASIS_PASSES[settings.basis]
+    relighting, projection = storage_bytes(settings.basis, n, s, coefficients, rays)
+    stored = relighting + projection + n * 77 + s * 24 + 4 * len(points.patches.nodes)
+    working = LANES * LANE_BYTES + 72 * s * (coefficients + 16) + 2 * stored
     return {
         "requires": _requirements(scene, points, int(probe["rays"] * n)),
         "settings": _reasons(settings, points, directions, coefficients),
@@ -61,22 +63,58 @@ def describe(source, parameters=None, **settings):
             "seconds": round(loading + sampling + transport + basis + 1.0, 1),
             "peak_memory_bytes": int(peak_memory_bytes() + working),
             "bytes": int(stored),
+            "relighting_bytes": int(relighting),
+            "projection_bytes": int(projection),
         },
     }
 
 
+def storage_bytes(basis, points, directions, coefficients, rays_per_direction=1):
+    """What has to be kept for relighting (Eigentransport, section 7.1).
+
+    Parameters
+    ----------
+    basis : str
+    points, directions, coefficients : int
+        v, s and d of the paper.
+    rays_per_direction : int
+
+    Returns
+    -------
+    relighting : int
+        Bytes of the coefficients of all points and of the light: 4d(v + 1), single precision. `haar` adds the indices of its
+        coefficients, `none` takes a bit for each ray.
+    projection : int
+        Bytes of the matrix that projects light: 4ds. `haar` needs none, its transform is computed.
+    """
+    light = {"haar": directions, "none": directions}.get(basis, coefficients)
+    relighting = coefficient_bytes(basis, points, directions, coefficients, rays_per_direction) + 4 * light
+    projection = {"haar": 0, "none": 4 * directions}.get(basis, 4 * coefficients * directions)
+    return relighting, projection
+
+
 def describe_asset(asset):
-    """What an asset holds, as plain data."""
-    d = len(asset.basis.vectors)
-    n, s = len(asset.points), len(asset.directions)
+    """What an asset holds, as plain data.
+
+    `storage` has bytes as predicted by the formula of the paper's section 7.1 (see `storage_bytes`) and as measured: of the arrays
+    in the file and of the file.
+    """
+    n, s, d = len(asset.points), len(asset.directions), len(asset.basis)
+    relighting, projection = storage_bytes(asset.basis.kind, n, s, d, asset.settings["rays_per_direction"])
+    measured = {
+        "coefficients": sum(array.nbytes for array in coefficient_arrays(asset.coefficients).values()),
+        "basis": sum(getattr(asset.basis, name).nbytes for name in asset.basis.ARRAYS),
+        "file": asset.path.stat().st_size if asset.path else None,
+    }
     return {
         "points": n,
         "directions": s,
+        "basis": asset.basis.kind,
         "coefficients": d,
         "captured_variance": asset.report["captured_variance"],
+        "relative_error": asset.report["relative_error"],
         "captured_variance_per_component": [round(float(v), 6) for v in asset.basis.captured_variance],
-        "relighting_bytes": 4 * d * (n + 1),  # Eigentransport section 7.1
-        "projection_bytes": 4 * d * s,
+        "storage": {"predicted": {"relighting": relighting, "projection": projection}, "measured": measured},
         "buried_points": int(asset.buried.sum()),
         "scene": asset.scene,
         "settings": asset.settings,
@@ -136,7 +174,12 @@ def _reasons(settings, points, directions, coefficients):
     reasons = {
         "directions": f"{len(directions):,} cells, about {np.degrees(np.sqrt(4 * np.pi / len(directions))):.1f}° wide: "
         "sharper shadows need more",
-        "coefficients": "48 relight in about a millisecond; more of them sharpen shadows"
+        "basis": "components of this scene's own transport: the least error for their number"
+        if settings.basis == "pca"
+        else "as asked",
+        "coefficients": f"as few as capture {settings.variance:g} of the variance; the prediction takes {AUTO_COEFFICIENTS}"
+        if settings.variance is not None
+        else "48 relight in about a millisecond; more of them sharpen shadows"
         if settings.coefficients is None
         else "as asked",
         "edge_length": auto if settings.edge_length == "auto" else "as asked",
@@ -144,4 +187,7 @@ def _reasons(settings, points, directions, coefficients):
         "seed": "start of the randomized fit",
     }
     chosen |= {"coefficients": coefficients, "edge_length": round(edge, 6)}
+    if settings.variance is not None:
+        chosen["coefficients"] = "auto"
+        reasons["variance"] = "share of the transport's variance to capture"
     return {name: {"value": chosen[name], "reason": reason} for name, reason in reasons.items()}

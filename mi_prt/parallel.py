@@ -9,6 +9,8 @@ from functools import cache
 
 from .runtime import thread_count
 
+BLOCK_ROWS = 128  # rows of transport worked on at a time: a block of a few MB stays in the processor's cache
+
 
 def map_chunks(function, chunks):
     """Results of `function` on each chunk, in order; chunks run on `runtime.thread_count()` threads."""

@@ -1,23 +1,33 @@
 """From a scene to an asset: points, transport, basis, coefficients."""
 
+import hashlib
 import time
+from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass
 
 import numpy as np
+import scipy.sparse
 
 from .asset import Asset
-from .basis.pca import BLOCK_ROWS, fit_pca
+from .basis.bases import check_basis, check_components, default_components, fit_basis, most_components
+from .basis.none import NoBasis
+from .basis.rows import Rows
+from .basis.target import Fit, Target
 from .directions import parse_directions
 from .errors import SettingsError
-from .parallel import map_chunks
-from .points.points import sample_points
+from .memory import free_bytes, parse_bytes, resident_bytes
+from .parallel import BLOCK_ROWS, map_chunks
+from .points.points import POINT_FIELDS, sample_points
 from .provenance import describe_scene
-from .runtime import count_kernels, peak_memory_bytes, versions
+from .runtime import count_kernels, peak_memory_bytes, thread_count, versions
 from .scene.scene import open_scene
-from .transport.direct import find_buried, sample_direct
+from .transport.direct import LANES, DirectSampler, find_buried
+from .workspace import durable, temporary
 
-DEFAULT_COEFFICIENTS = 48
+DEFAULT_VARIANCE = 0.95
 MAX_RAYS_PER_DIRECTION = 64
+LANE_BYTES = 80  # of a wavefront, for each of its rays
+LEAST_LANES = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -27,10 +37,15 @@ class Settings:
     Parameters
     ----------
     directions : str
-        Direction lattice, ``cubemap:N``.
-    coefficients : int or None
-        Components of the basis. None takes 48, or the rank of the transport where that is lower; an explicit number
-        above the rank is refused.
+        Direction lattice: ``cubemap:N``, ``latlong:WxH`` or ``halton:N``.
+    basis : str
+        ``pca``, ``sh`` (spherical harmonics), ``haar`` (the best wavelets of each point), ``haar-shared`` (the same for all
+        points) or ``none`` (transport as it was sampled).
+    coefficients : int, 'auto' or None
+        Components of the basis. None takes 48 (49 harmonics), or the rank of the transport where that is lower; an explicit
+        number above the rank is refused; 'auto' takes as few as capture `variance`.
+    variance : float or None
+        Share of the transport's variance that 'auto' captures, 0.95 by default.
     edge_length : 'auto' or float
         Metres to which coarse faces and analytic shapes are tessellated.
     rays_per_direction : int
@@ -40,30 +55,58 @@ class Settings:
     Raises
     ------
     SettingsError
-        If a value is out of range.
+        If a value is out of range or values contradict each other.
     """
 
     directions: str = "cubemap:32"
-    coefficients: int | None = None
+    basis: str = "pca"
+    coefficients: int | str | None = None
+    variance: float | None = None
     edge_length: str | float = "auto"
     rays_per_direction: int = 1
     seed: int = 0
 
     def __post_init__(self):
-        object.__setattr__(self, "directions", str(parse_directions(self.directions)))
-        for name in ("coefficients", "rays_per_direction", "seed"):
+        lattice = parse_directions(self.directions)
+        object.__setattr__(self, "directions", str(lattice))
+        check_basis(self.basis)
+        for name, others in (("coefficients", (None, "auto")), ("rays_per_direction", ()), ("seed", ())):
             value = getattr(self, name)
-            if isinstance(value, bool) or not (isinstance(value, int | np.integer) or (name == "coefficients" and value is None)):
-                raise SettingsError(f"{name} must be an integer, got {value!r}")
-        if self.coefficients is not None and self.coefficients < 0:
-            raise SettingsError(f"coefficients must be ≥ 0, got {self.coefficients}")
+            if value not in others and (isinstance(value, bool) or not isinstance(value, int | np.integer)):
+                raise SettingsError(f"{name} must be an integer{' or auto' if others else ''}, got {value!r}")
         if not 1 <= self.rays_per_direction <= MAX_RAYS_PER_DIRECTION:
             raise SettingsError(f"rays per direction must be 1…{MAX_RAYS_PER_DIRECTION}, got {self.rays_per_direction}")
         if self.seed < 0:
             raise SettingsError(f"seed must be ≥ 0, got {self.seed}")
+        if self.coefficients == "auto":
+            if self.variance is None:
+                object.__setattr__(self, "variance", DEFAULT_VARIANCE)
+            Target(variance=self.variance)
+        elif self.variance is not None:
+            raise SettingsError(f"variance {self.variance:g} needs coefficients auto, got {self.coefficients or 'the default'}")
+        elif self.coefficients is not None and self.coefficients < 0:
+            raise SettingsError(f"coefficients must be ≥ 0, got {self.coefficients}")
+        if self.basis == "none" and self.coefficients is not None:
+            raise SettingsError(f"the basis none keeps all directions, so coefficients {self.coefficients} mean nothing: leave them out")
+        check_components(self.basis, lattice, None if self.coefficients == "auto" else self.coefficients)
+
+    def target(self, points):
+        """What the basis of so many points is asked for, a Target."""
+        if self.variance is not None:
+            return Target(variance=self.variance)
+        directions = parse_directions(self.directions)
+        if self.coefficients is None:
+            return Target(default_components(self.basis, directions, points))
+        largest = most_components(self.basis, directions, points)
+        if self.coefficients > largest:
+            raise SettingsError(
+                f"{self.coefficients} coefficients are above the rank of the transport: {points:,} points and "
+                f"{len(directions):,} directions allow at most {largest}"
+            )
+        return Target(int(self.coefficients))
 
 
-def precompute(scene, parameters=None, progress=None, **settings):
+def precompute(scene, parameters=None, progress=None, output=None, resume=False, max_memory=None, **settings):
     """Precompute a scene's transport.
 
     Parameters
@@ -71,35 +114,44 @@ def precompute(scene, parameters=None, progress=None, **settings):
     scene : path, dict or mi.Scene
     parameters : dict, optional
         Values for an XML file's `<default>` parameters.
-    progress : callable(stage, done, total), optional
-        Called as work advances; stages are 'transport', 'basis' and 'coefficients'.
+    progress : callable(stage, done, total, detail), optional
+        Called as work advances. Stages are 'transport' (in blocks of rays; the detail is rays per second), 'basis' (in passes
+        over the rows) and 'coefficients' (in points).
+    output : path, optional
+        File to save the asset to. What is computed on the way is kept beside it, in a folder with `.partial` behind the name,
+        until the file is whole: a run that was interrupted or killed can be continued.
+    resume : bool
+        Continue the unfinished run of `output`, if there is one. The file is the same as that of an undisturbed run.
+    max_memory : int or str, optional
+        Bytes, or such as '3G', that this process may have resident. By default what it has now and half of what is free.
     **settings
-        Fields of `Settings`: directions, coefficients, edge_length, rays_per_direction, seed.
+        Fields of `Settings`: directions, basis, coefficients, variance, edge_length, rays_per_direction, seed.
 
     Returns
     -------
     Asset
-        Its `report` holds counts and the captured variance.
+        Its `report` holds counts, the captured variance and the relative error of the transport.
 
     Raises
     ------
     SceneError, SettingsError
-        See `open_scene`, `sample_points`, `Settings`.
+        See `open_scene`, `sample_points`, `Settings`, `workspace.durable`.
     """
-    return measure(scene, parameters, progress, **settings)[0]
+    return measure(scene, parameters, progress, output, resume, max_memory, **settings)[0]
 
 
-def measure(scene, parameters=None, progress=None, **settings):
+def measure(scene, parameters=None, progress=None, output=None, resume=False, max_memory=None, **settings):
     """`precompute`, and what it cost.
 
     Returns
     -------
     asset : Asset
     cost : dict
-        rays, kernels (compiled), peak_memory_bytes, seconds{scene, points, transport, basis}.
+        rays, kernels (compiled), peak_memory_bytes, seconds{scene, points, transport, basis, write} of this run alone.
     """
     settings = Settings(**settings)
-    progress = progress or (lambda stage, done, total: None)
+    limit = parse_bytes(max_memory) if max_memory is not None else resident_bytes() + free_bytes() // 2
+    progress = progress or (lambda stage, done, total, detail="": None)
     clock = _Clock()
     with count_kernels() as kernels:
         scene = open_scene(scene, parameters)
@@ -107,33 +159,40 @@ def measure(scene, parameters=None, progress=None, **settings):
         clock.lap("scene")
         points = sample_points(scene, settings.edge_length)
         directions = parse_directions(settings.directions)
-        _check_coefficients(settings.coefficients, len(points), len(directions))
+        target = settings.target(len(points))
+        room = Room(limit, points, directions, settings, target)
         clock.lap("points")
-        transport = sample_direct(
-            scene, points, directions, settings.rays_per_direction, lambda *done: progress("transport", *done)
-        )
-        dark = ~transport.bits.any(axis=1)
-        buried = find_buried(scene, points, dark)
-        clock.lap("transport")
-        basis, coefficients = _compress(transport, directions, buried, settings, progress)
-        clock.lap("basis")
-    report = {
-        "rays": transport.rays,
-        "dark_points": int(dark.sum()),
-        "buried_points": int(buried.sum()),
-        "captured_variance": float(basis.captured_variance.sum()),
-    }
-    asset = Asset(
-        points,
-        buried,
-        directions,
-        basis,
-        coefficients,
-        scene=description,
-        settings=asdict(settings) | {"coefficients": len(basis.vectors), "edge_length": points.report["edge_length"]},
-        versions=versions(),
-        report=report,
-    )
+        run = _identity(settings, scene, points)
+        with _workspace(output, run, resume) as workspace:
+            sampler = DirectSampler(scene, points, directions, settings.rays_per_direction, room.lanes)
+            with closing(workspace.rows("visibility", len(points), sampler.row_bytes)) as bits:
+                _sample(sampler, bits, room.lanes, progress)
+                transport = sampler.transport(bits)
+                dark = transport.dark()
+                buried = find_buried(scene, points, dark)
+                clock.lap("transport")
+                fit, coefficients = _compress(transport, directions, buried, settings, target, room, workspace, run, progress)
+                clock.lap("basis")
+            asset = Asset(
+                points,
+                buried,
+                directions,
+                fit.basis,
+                coefficients,
+                scene=description,
+                settings=asdict(settings) | {"coefficients": len(fit.basis), "edge_length": points.report["edge_length"]},
+                versions=versions(),
+                report={
+                    "rays": transport.rays,
+                    "dark_points": int(dark.sum()),
+                    "buried_points": int(buried.sum()),
+                    "captured_variance": fit.captured_variance,
+                    "relative_error": fit.relative_error,
+                },
+            )
+            if output is not None:
+                asset.save(output)
+                clock.lap("write")
     cost = {
         "rays": transport.rays,
         "kernels": kernels.compiled,
@@ -143,37 +202,112 @@ def measure(scene, parameters=None, progress=None, **settings):
     return asset, cost
 
 
-def _check_coefficients(wanted, points, directions):
-    largest = min(points - 1, directions)
-    if wanted is not None and wanted > largest:
-        raise SettingsError(
-            f"{wanted} coefficients are above the rank of the transport: {points:,} points and {directions:,} directions "
-            f"allow at most {largest}"
+@contextmanager
+def _workspace(output, run, resume):
+    with temporary() if output is None else durable(output, run, resume) as workspace:
+        yield workspace
+
+
+def _identity(settings, scene, points):
+    """All that the result depends on: what must not change between a run and its continuation."""
+    digest = hashlib.sha256(scene.hash.encode())
+    for name in POINT_FIELDS:
+        digest.update(np.ascontiguousarray(getattr(points, name)).tobytes())
+    return {"scene": digest.hexdigest()[:16], "points": len(points), **asdict(settings), "versions": versions()}
+
+
+class Room:
+    """What fits into the memory that a run may take.
+
+    Parameters
+    ----------
+    limit : int
+        Bytes that the process may have resident.
+    points : Points
+    directions : DirectionLattice
+    settings : Settings
+    target : Target
+
+    Attributes
+    ----------
+    lanes : int
+        Rays of a wavefront.
+    basis : int
+        Bytes that fitting a basis may take beside the coefficients.
+
+    Raises
+    ------
+    SettingsError
+        If the least that the run needs does not fit.
+    """
+
+    def __init__(self, limit, points, directions, settings, target):
+        held = resident_bytes()
+        blocks = 16 * BLOCK_ROWS * len(directions) * settings.rays_per_direction * (thread_count() + 1)
+        coefficients = coefficient_bytes(
+            settings.basis, len(points), len(directions), target.components or 0, settings.rays_per_direction
         )
+        kept = 160 * len(points) + blocks + 2 * coefficients
+        free = limit - held - kept
+        least = LANE_BYTES * LEAST_LANES
+        if free < least:
+            raise SettingsError(
+                f"memory {limit / 1e6:,.0f} MB is too little: the scene holds {held / 1e6:,.0f} MB and the run needs "
+                f"{(kept + least) / 1e6:,.0f} MB more; raise max_memory (--max-memory) or use fewer points, directions or coefficients"
+            )
+        self.lanes = int(min(LANES, free // LANE_BYTES))
+        self.basis = free
 
 
-def _compress(transport, directions, buried, settings, progress):
+def coefficient_bytes(basis, points, directions, components, rays_per_direction=1):
+    """Bytes of the coefficients of all points, as they are stored."""
+    if basis == "none":
+        return points * -(-directions * rays_per_direction // 16)
+    index = (2 if directions <= 1 << 16 else 4) if basis == "haar" else 0
+    return points * components * (4 + index)
+
+
+def _sample(sampler, bits, lanes, progress):
+    """Trace what of the transport is not there yet."""
+    per_block = max(1, lanes // sampler.rays_per_point)
+    total = -(-bits.count // per_block)
+    started, traced = time.perf_counter(), 0
+    progress("transport", total - -(-(bits.count - bits.filled) // per_block), total, "")
+    for block in sampler.blocks(bits.filled):
+        bits.append(block)
+        traced += len(block) * sampler.rays_per_point
+        rate = traced / max(time.perf_counter() - started, 1e-9)
+        progress("transport", total - -(-(bits.count - bits.filled) // per_block), total, f"{rate / 1e6:.1f} million rays/s")
+
+
+def _compress(transport, directions, buried, settings, target, room, workspace, run, progress):
     """Fit the basis to the points that are not buried (they would only pull it), then encode all points."""
-    n = len(transport.bits)
+    n, _ = transport.shape
+    if settings.basis == "none":
+        basis = NoBasis(directions.solid_angles.astype(np.float32))
+        return Fit(basis, 1.0, 0.0), transport.in_memory()
     kept = np.flatnonzero(~buried) if not buried.all() else np.arange(n)
-    wanted = DEFAULT_COEFFICIENTS if settings.coefficients is None else settings.coefficients
-    basis = fit_pca(
-        transport.rows, kept, directions.solid_angles, wanted, settings.seed, lambda *done: progress("basis", *done)
+    fit = fit_basis(
+        settings.basis,
+        Rows(transport.rows, kept, directions),
+        target,
+        settings.seed,
+        lambda *done: progress("basis", *done, ""),
+        keep=workspace.keep,
+        max_bytes=room.basis,
     )
-    if settings.coefficients is not None and len(basis.vectors) < settings.coefficients:
+    if settings.coefficients not in (None, "auto") and len(fit.basis) < settings.coefficients:
+        # Another number may be asked for when the run is continued.
+        workspace.record({key: value for key, value in run.items() if key != "coefficients"})
         raise SettingsError(
-            f"{settings.coefficients} coefficients are above the rank of the transport: at most {len(basis.vectors)}"
+            f"{settings.coefficients} coefficients are above the rank of the transport: at most {len(fit.basis)}"
         )
-    coefficients = np.empty((n, len(basis.vectors)), np.float32)
-
-    def encode(first):
-        block = slice(first, first + BLOCK_ROWS)
-        coefficients[block] = basis.encode(transport.rows(block))
-        return min(first + BLOCK_ROWS, n)
-
-    for done in map_chunks(encode, range(0, n, BLOCK_ROWS)):
-        progress("coefficients", done, n)
-    return basis, coefficients
+    blocks = []
+    starts = range(0, n, BLOCK_ROWS)
+    for block in map_chunks(lambda first: fit.basis.encode(transport.rows(slice(first, first + BLOCK_ROWS))), starts):
+        blocks.append(block)
+        progress("coefficients", min(len(blocks) * BLOCK_ROWS, n), n, "")
+    return fit, scipy.sparse.vstack(blocks, format="csr") if scipy.sparse.issparse(blocks[0]) else np.concatenate(blocks)
 
 
 class _Clock:

@@ -1,10 +1,14 @@
 """From an asset and light to a file: image, mesh with vertex radiance, or plain arrays."""
 
 import time
+import warnings
 from pathlib import Path
 
-from .errors import SettingsError
+from .errors import SceneError, SettingsError
+from .evaluate.local_lights import local_irradiance, measure_error
 from .files import check_writable
+from .lighting.environment import LightWarning
+from .lighting.local import hull_warning
 from .lighting.scene_light import lit_scene, turned_light
 from .provenance import open_scene_of
 from .render.display import exposure
@@ -17,7 +21,18 @@ MESHES = (".ply", ".npz")
 RENDERERS = ("mitsuba", "raster")
 
 
-def relight_to_file(asset, output, light=None, rotate=None, scene=None, sensor=0, size=None, renderer="mitsuba", spp=64):
+def relight_to_file(
+    asset,
+    output,
+    light=None,
+    rotate=None,
+    scene=None,
+    sensor=0,
+    size=None,
+    renderer="mitsuba",
+    spp=64,
+    nearest=1,
+):
     """Relight an asset and write the result.
 
     Parameters
@@ -28,7 +43,7 @@ def relight_to_file(asset, output, light=None, rotate=None, scene=None, sensor=0
     light : what `as_light` accepts, optional
         By default the scene's own distant light.
     rotate : (axis, degrees), optional
-        Turns the light.
+        Turns the distant light.
     scene : path, dict or mi.Scene, optional
         If the asset's scene is somewhere else by now.
     sensor : int
@@ -37,15 +52,24 @@ def relight_to_file(asset, output, light=None, rotate=None, scene=None, sensor=0
         The integrator `prt`, or pyrender.
     spp : int
         Samples per pixel of the integrator.
+    nearest : int
+        Directions that stand for a local light, see `Asset.irradiance`.
 
     Returns
     -------
     dict
-        points, seconds{project, relight, render}.
+        points, seconds{project, relight, render}. With local lights, and where the scene is opened, which it is for images
+        and if one of them is inside its convex hull: local_light_error{relative_rmse, bias, points}, the error of their
+        irradiance against Mitsuba's.
 
     Raises
     ------
     SettingsError, SceneError, LightError
+
+    Warns
+    -----
+    LightWarning
+        If a local light is inside the convex hull of the scene; with the measured error.
     """
     output = Path(output)
     suffix = output.suffix.lower()
@@ -57,14 +81,17 @@ def relight_to_file(asset, output, light=None, rotate=None, scene=None, sensor=0
 
     needs_scene = suffix in IMAGES or light is None
     opened = open_scene_of(asset, scene) if needs_scene else None
-    shown, cells_light = turned_light(opened, light, rotate)
+    shown, chosen = turned_light(opened, light, rotate)
     if renderer == "raster":
         from .render.raster import RasterScene  # opens OpenGL: only where it is asked for
 
     clock = [time.perf_counter()]
-    projected = asset.project_light(cells_light)
+    projected = asset.project_light(chosen.distant)
     clock.append(time.perf_counter())
     irradiance = asset.irradiance_from(*projected)
+    if chosen.points:
+        local = local_irradiance(asset, chosen.points, nearest)
+        irradiance += local
     radiance = asset.outgoing_radiance(irradiance)
     clock.append(time.perf_counter())
     if suffix == ".ply":
@@ -79,9 +106,25 @@ def relight_to_file(asset, output, light=None, rotate=None, scene=None, sensor=0
                 with RasterScene(asset, lit, camera) as raster:
                     image = raster.radiance(irradiance)
             else:
-                image = render_image(asset, lit.mi_scene, camera, spp)
+                image = render_image(asset, lit.mi_scene, camera, spp, irradiance=irradiance)
         write_image(output, image, factor)
     clock.append(time.perf_counter())
     stages = zip(("project", "relight", "render"), clock, clock[1:])
-    return {"points": len(asset.points), "seconds": {name: round(b - a, 5) for name, a, b in stages}}
+    result = {"points": len(asset.points), "seconds": {name: round(b - a, 5) for name, a, b in stages}}
+    if chosen.points:
+        result |= _local_light_error(asset, chosen.points, local, opened, scene)
+    return result
 
+
+def _local_light_error(asset, lights, local, opened, scene):
+    """The entry local_light_error, or none where the scene is neither open nor needed, or not to be had."""
+    if opened is None:
+        warning = hull_warning(lights, asset.points.positions)
+        if not warning:
+            return {}
+        try:
+            opened = open_scene_of(asset, scene)
+        except SceneError as error:
+            warnings.warn(f"{warning}; by how much it errs cannot be measured: {error}", LightWarning, stacklevel=3)
+            return {}
+    return {"local_light_error": measure_error(asset, lights, local, opened)}

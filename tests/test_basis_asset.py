@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import h5py
 import numpy as np
@@ -16,7 +17,10 @@ import mi_prt
 import mi_prt.transport.direct
 from conftest import bias, cube, diffuse, disk, rectangle, relative_l2, scene, sphere, uniform_sky
 from mi_prt import AssetError, SettingsError
-from mi_prt.basis.pca import EXACT_SIDE, fit_pca
+from mi_prt.basis import pca
+from mi_prt.basis.pca import fit_pca
+from mi_prt.basis.rows import Rows
+from mi_prt.basis.target import Target
 from mi_prt.directions import Cubemap
 from mi_prt.lighting.cells import cell_radiance
 from mi_prt.precompute import measure
@@ -59,9 +63,14 @@ def random_matrix(n, s, rank=None, decay=6.0, seed=0):
     return (left * values @ right + 3 * rng.random(s)).astype(np.float32)
 
 
-def fit(matrix, weights, components, index=None, **seed):
+def fitted(matrix, weights, components=None, index=None, variance=None, **options):
     index = np.arange(len(matrix)) if index is None else index
-    return fit_pca(lambda rows: matrix[rows].copy(), index, weights, components, **seed)
+    rows = Rows(lambda rows: matrix[rows].copy(), index, SimpleNamespace(solid_angles=weights))
+    return fit_pca(rows, Target(components, variance), **options)
+
+
+def fit(matrix, weights, components, index=None, **options):
+    return fitted(matrix, weights, components, index, **options).basis
 
 
 def svd(matrix, weights):
@@ -86,13 +95,12 @@ ITERATED = [(2400, 900, 40), (900, 1800, 40), (3000, 800, None)]
 def test_components_are_those_of_the_svd(n, s, rank):
     """The decomposition is unique: exact for small shapes; iterated, captured variance is within 1e-3 of the optimum.
 
-    Shapes choose the path: one side up to EXACT_SIDE, or both beyond it.
+    Small shapes are exact; where no Gram matrix may be held, they are iterated.
     """
     components = 16
     exact = (n, s, rank) in EXACT
-    assert (min(n, s) <= EXACT_SIDE) == exact
     matrix, weights = random_matrix(n, s, rank), np.random.default_rng(1).random(s) + 0.2
-    basis = fit(matrix, weights, components)
+    basis = fit(matrix, weights, components, **({} if exact else dict(max_bytes=0)))
     weighted, squares, vectors = svd(matrix, weights)
     optimum = squares[:components] / squares.sum()
     assert basis.vectors.shape == (components, s)
@@ -149,7 +157,8 @@ def test_components_beyond_the_rank_are_left_out(n, s, rank):
 def test_many_points_do_not_lower_the_rank(n, s):
     """Repeating every row k times multiplies all squared singular values by k and leaves their shares as they were."""
     table, weights = random_matrix(2000, s), np.ones(s)
-    basis = fit_pca(lambda rows: table[rows % 2000], np.arange(n), weights, 16)
+    rows = Rows(lambda rows: table[rows % 2000], np.arange(n), SimpleNamespace(solid_angles=weights))
+    basis = fit_pca(rows, Target(16)).basis
     _, squares, _ = svd(table, weights)
     assert len(basis.vectors) == 16
     assert abs(basis.captured_variance.sum() - squares[:16].sum() / squares.sum()) < 1e-3
@@ -442,13 +451,15 @@ def test_a_failing_write_leaves_the_old_file(asset, tmp_path, monkeypatch, error
     """All or nothing: what was there stays, and no temporary file is left; what a full disk or HDF5 raises is a SettingsError."""
     path = tmp_path / "old.prt"
     path.write_text("old")
+    write, written = h5py.Group.__setitem__, []
 
-    def fail(self, content):
-        with open(self, "wb") as file:
-            file.write(b"half")
-        raise error
+    def fail(self, name, value):
+        written.append(name)
+        if len(written) > 10:
+            raise error
+        write(self, name, value)
 
-    monkeypatch.setattr(Path, "write_bytes", fail)
+    monkeypatch.setattr(h5py.Group, "__setitem__", fail)
     with pytest.raises(type(error) if isinstance(error, KeyboardInterrupt) else SettingsError):
         asset.save(path)
     assert path.read_bytes() == b"old" and os.listdir(tmp_path) == ["old.prt"]

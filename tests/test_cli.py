@@ -48,7 +48,7 @@ def test_precompute_prints_the_promised_keys_and_nothing_else_on_stdout(scene, t
     result = json.loads(out)
     assert code == 0
     assert set(result) == {
-        "points", "directions", "coefficients", "captured_variance", "bytes", "rays", "kernels", "peak_memory_bytes", "seconds",
+        "points", "directions", "coefficients", "captured_variance", "relative_error", "bytes", "rays", "kernels", "peak_memory_bytes", "seconds",
     }
     assert set(result["seconds"]) == {"scene", "points", "transport", "basis", "write", "total"}
     assert result["directions"] == 384 and result["coefficients"] == 16
@@ -103,7 +103,7 @@ def test_info_of_a_scene_and_of_an_asset(scene, asset, capsys):
     result = json.loads(out)
     assert code == 0
     assert set(result) == {"requires", "settings", "left_out", "predicted"}
-    assert set(result["predicted"]) == {"seconds", "peak_memory_bytes", "bytes"}
+    assert set(result["predicted"]) == {"seconds", "peak_memory_bytes", "bytes", "relighting_bytes", "projection_bytes"}
     assert all({"value", "reason"} == set(entry) for entry in result["settings"].values())
     code, out, _ = run(capsys, "info", asset, "--json")
     assert code == 0 and json.loads(out)["coefficients"] == 16
@@ -219,13 +219,13 @@ def test_a_moved_scene_is_named_and_found_again(scene, tmp_path, capsys):
     assert code == 0
 
 
-def test_interrupting_leaves_nothing_behind(scene, tmp_path):
-    """SIGINT while rays are traced: exit code 1, no asset, no temporary file, no traceback."""
+def test_interrupting_leaves_only_what_can_be_continued(scene, tmp_path):
+    """SIGINT while rays are traced: exit code 1, no asset, no traceback; the folder of the run, from which it goes on."""
     command = [sys.executable, "-m", "mi_prt", "precompute", str(scene), "-o", str(tmp_path / "a.prt")]
     process = subprocess.Popen([*command, "--rays-per-direction", "64"], stderr=subprocess.PIPE, text=True)
     time.sleep(4)
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=60)
     assert process.returncode in (1, 130)
-    assert list(tmp_path.iterdir()) == []
+    assert [path.name for path in tmp_path.iterdir()] == ["a.prt.partial"]
     assert "Traceback" not in err

@@ -21,7 +21,7 @@ from conftest import (
     uniform_directions,
     uniform_sky,
 )
-from mi_prt import DirectionalLight, DistantLight, EnvironmentMap, LightError, LightWarning, SettingsError
+from mi_prt import DirectionalLight, EnvironmentMap, Light, LightError, LightWarning, SettingsError
 from mi_prt.directions import Cubemap, parse_directions
 from mi_prt.lighting.cells import cell_radiance
 from mi_prt.lighting.environment import rotation_matrix
@@ -293,9 +293,9 @@ def test_rotated_light_equals_mitsubas_rotated_emitter(axis):
 
 
 def test_rotating_light_of_all_kinds_together():
-    """DistantLight turns all its parts; a directional light turned by `rotated` comes from the turned direction."""
+    """A Light turns all its parts; a directional light turned by `rotated` comes from the turned direction."""
     sun = DirectionalLight([0, 0, -1.0], [1, 1, 1])  # from +z
-    both = DistantLight((EnvironmentMap(uniform_sky()),), (sun,)).rotated("y", 90)  # +z to +x
+    both = Light((EnvironmentMap(uniform_sky()),), (sun,)).rotated("y", 90)  # +z to +x
     np.testing.assert_allclose(both.directionals[0].direction, [-1, 0, 0], atol=1e-12)
     np.testing.assert_allclose(both.maps[0].rotation @ [0, 0, 1], [1, 0, 0], atol=1e-12)
 
@@ -318,13 +318,13 @@ def test_prepared_light_turns_like_the_map():
     asset = mi_prt.precompute(scene(ball=sphere()), directions="cubemap:16", edge_length=1.0)
     pixels = sky_of(lambda d: np.exp(2 * d @ np.array([[0.5, 1, 0], [0.5, 0, 1], [0.7, 0, 0.1]])), 64)
     sun = DirectionalLight([0, -1, 0.2], [1, 1, 1])
-    exact = DistantLight((EnvironmentMap(pixels),), (sun,))
+    exact = Light((EnvironmentMap(pixels),), (sun,))
     prepared = asset.prepare_light(exact)
     flat = asset.prepare_light(uniform_sky([1.0, 2.0, 3.0]))
     for axis, degrees in [("y", 0), ("y", 33), ((1, 2, 3), 120), ("z", -7)]:
         now, then = prepared.rotated(axis, degrees), exact.rotated(axis, degrees)
         np.testing.assert_allclose(energy_of(now), energy_of(then), rtol=1e-4)
-        without = [cell_radiance(DistantLight(l.maps), LATTICE) for l in (now, then)]
+        without = [cell_radiance(Light(l.maps), LATTICE) for l in (now, then)]
         assert relative_l2(*without) < 0.02
         np.testing.assert_allclose(cell_radiance(flat.rotated(axis, degrees), LATTICE) / [1, 2, 3], 1, rtol=1e-3)
         assert relative_l2(asset.irradiance(now), asset.irradiance(then)) < 5e-3
@@ -333,7 +333,7 @@ def test_prepared_light_turns_like_the_map():
 def test_lit_scene_gives_mitsuba_the_same_light():
     """What `lit_scene` hands to Mitsuba shows the light's radiance in all directions, and its directional lights."""
     rng = np.random.default_rng(6)
-    light = DistantLight(
+    light = Light(
         (EnvironmentMap(rng.random((8, 16, 3)), random_rotation(rng)),), (DirectionalLight([1, -2, 0.5], [3, 2, 1]),)
     )
     lit = lit_scene(mi.load_dict(scene(s=sphere(), old={"type": "constant"})), light)
@@ -536,7 +536,9 @@ def test_files_that_cannot_be_read(tmp_path):
         ([0, 1], [1, 1, 1]),
         ([0, 1, 0], [1, -1, 1]),
         ([0, 1, 0], [1, np.inf, 1]),
-        ([0, 1, 0], 1.0),
+        ([0, 1, 0], [1, 1]),
+        ([0, 1, 0], "bright"),
+        ("down", 1.0),
     ],
 )
 def test_bad_directional_lights(direction, irradiance):

@@ -11,6 +11,7 @@ from ..provenance import open_scene_of
 from ..render.display import display, exposure
 from ..render.image import coverage, pick_sensor, render_image, resized
 from . import ground_truth, metrics
+from .local_lights import local_irradiance, measure_error
 from .report import write_report
 
 REFERENCES = ("modelled", "full")
@@ -31,6 +32,7 @@ def compare(
     reference="modelled",
     seed=0,
     progress=lambda stage, done, total: None,
+    nearest=1,
 ):
     """Compare an asset with Mitsuba and write the comparison to a folder.
 
@@ -42,7 +44,7 @@ def compare(
     light : what `as_light` accepts, optional
         By default the scene's own distant light.
     rotate : (axis, degrees), optional
-        Turns the light.
+        Turns the distant light.
     scene : path, dict or mi.Scene, optional
         If the asset's scene is somewhere else by now.
     sensor : int
@@ -54,12 +56,20 @@ def compare(
         Truth as modelled (other materials replaced by their diffuse albedo, local emitters dark) or as written.
     seed : int
     progress : callable(stage, done, total)
+    nearest : int
+        Directions that stand for a local light, see `Asset.irradiance`.
 
     Returns
     -------
     dict
         points{count, relative_rmse, bias, reference_noise, …}, image{relative_rmse, bias, psnr, flip,
-        reference_noise, …}, seconds{relight, reference}, and what was compared.
+        reference_noise, …}, seconds{relight, reference}, and what was compared. With local lights also
+        local_light_error{relative_rmse, bias, points}: that of their irradiance alone.
+
+    Warns
+    -----
+    LightWarning
+        If a local light is inside the convex hull of the scene; with the measured error.
     """
     if reference not in REFERENCES:
         raise SettingsError(f"reference '{reference}' is not known: use {' or '.join(REFERENCES)}")
@@ -67,13 +77,16 @@ def compare(
         raise SettingsError(f"spp {spp} is too low: the reference's noise is told from two halves, so at least 2")
     folder = _made_folder(folder)
     opened = open_scene_of(asset, scene)
-    shown, cells_light = turned_light(opened, light, rotate)
+    shown, chosen_light = turned_light(opened, light, rotate)
     truth = lit_scene(opened.modelled() if reference == "modelled" else opened.mi_scene, shown)
     seconds = {}
 
     progress("relight", 0, 3)
     started = time.perf_counter()
-    irradiance = asset.irradiance(cells_light)
+    irradiance = asset.irradiance(chosen_light.distant)
+    if chosen_light.points:
+        local = local_irradiance(asset, chosen_light.points, nearest)
+        irradiance += local
     seconds["relight"] = time.perf_counter() - started
 
     progress("reference at the points", 1, 3)
@@ -85,7 +98,7 @@ def compare(
     with resized(pick_sensor(truth, sensor), size) as camera:
         expected = ground_truth.image(truth, camera, spp, seed)
         seconds["reference"] = time.perf_counter() - started
-        result = render_image(asset, truth, camera, IMAGE_SAMPLES, seed)
+        result = render_image(asset, truth, camera, IMAGE_SAMPLES, seed, irradiance)
         covered = coverage(truth, camera, IMAGE_SAMPLES, seed) > 1 - 1e-4
     progress("report", 3, 3)
 
@@ -94,13 +107,15 @@ def compare(
         "scene": opened.source.path,
         "reference": reference,
         "left_out": asset.scene["left_out"],
-        "coefficients": len(asset.basis.vectors),
+        "coefficients": len(asset.basis),
         "directions": len(asset.directions),
         "captured_variance": asset.report["captured_variance"],
         "points": {"count": len(chosen)} | _errors(irradiance[chosen], at_points),
         "image": _image_errors(result, expected, covered),
         "seconds": {name: round(value, 4) for name, value in seconds.items()},
     }
+    if chosen_light.points:
+        report["local_light_error"] = measure_error(asset, chosen_light.points, local, opened, seed)
     write_report(folder, report, result, expected.mean, covered)
     return report
 

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..lighting.scene_light import point_emitter
 from ..runtime import mitsuba
 from ..scene.scene import scale_of
 
@@ -34,51 +35,106 @@ class Reference:
 def point_irradiance(mi_scene, points, spp, seed=0):
     """Irradiance at points by Mitsuba's emitter sampling: no lattice, no basis, none of this program's rays.
 
+    Samples are stratified along the number that picks the emitter, so that each gets its share of them. A few local and
+    directional lights then have next to no noise.
+
     Parameters
     ----------
     mi_scene : mi.Scene
     points : Points
     spp : int
-        Samples of the emitters at each point.
+        Samples of the emitters at each point, rounded up to an even number.
     seed : int
 
     Returns
     -------
     Reference
-        mean and standard_error (n, 3) in W/m².
+        mean and standard_error (n, 3) in W/m². The error is told from neighbouring samples.
     """
     import drjit as dr
 
     mi = mitsuba()
+    spp += spp % 2
     step = max(1, LANES // spp)
     count = len(points)
     means, errors = np.empty((count, 3)), np.empty((count, 3))
     sampler = mi.load_dict({"type": "independent"})
     per_point = dr.opaque(mi.UInt32, spp)
+    interaction = _interactions(mi_scene, points)
+    for block, first in enumerate(range(0, count, step)):
+        size = min(step, count - first)
+        sampler.seed(seed + block * 7919, size * spp)
+        lane = dr.arange(mi.UInt32, size * spp)
+        si = interaction(lane // per_point + dr.opaque(mi.UInt32, first))
+        place = sampler.next_2d()
+        place.x = (mi.Float(lane % per_point) + place.x) / mi.Float(per_point)
+        sample, weight = mi_scene.sample_emitter_direction(si, place, True)
+        value = _received(si, sample, weight)
+        sums = [dr.block_sum(channel, spp) for channel in value]
+        # The squared difference of samples of neighbouring strata is, in the mean, no less than the sum of their variances.
+        pairs = dr.arange(mi.UInt32, size * spp // 2) * 2
+        differences = [dr.gather(mi.Float, x, pairs) - dr.gather(mi.Float, x, pairs + 1) for x in value]
+        squares = [dr.block_sum(x * x, spp // 2) for x in differences]
+        dr.eval(sums, squares)
+        block = slice(first, first + size)
+        means[block] = np.stack([np.array(x, dtype=np.float64) for x in sums], axis=-1) / spp
+        errors[block] = np.sqrt(np.stack([np.array(x, dtype=np.float64) for x in squares], axis=-1)) / spp
+    return Reference(means, errors)
+
+
+def local_irradiance(mi_scene, points, lights):
+    """Irradiance at points under local lights by Mitsuba's emitters and shadow rays, one light at a time: without noise.
+
+    Parameters
+    ----------
+    mi_scene : mi.Scene
+        Whose shapes cast the shadows; its own emitters do not shine.
+    points : Points
+    lights : sequence of PointLight
+
+    Returns
+    -------
+    (n, 3) float64
+        W/m².
+    """
+    import drjit as dr
+
+    mi = mitsuba()
+    si = _interactions(mi_scene, points)(dr.arange(mi.UInt32, len(points)))
+    total = np.zeros((len(points), 3))
+    for light in lights:
+        sample, weight = mi.load_dict(point_emitter(light)).sample_direction(si, mi.Point2f(0.5))
+        lit = ~mi_scene.ray_test(si.spawn_ray_to(sample.p))
+        total += np.array(_received(si, sample, weight) & lit).T
+    return total
+
+
+def _interactions(mi_scene, points):
+    """A function of indices (mi.UInt32) that gives Mitsuba's interactions at those points."""
+    import drjit as dr
+
+    mi = mitsuba()
     # A rim may lie on another surface, where Mitsuba's own offset along the normal would leave rays on either side of it.
     positions = points.positions + np.float32(RIM_INSET * scale_of(mi_scene)) * points.insets
     positions, normals = mi.Float(positions.ravel()), mi.Float(points.normals.ravel())
     geometric = mi.Float(points.geometric_normals.ravel())
-    for block, first in enumerate(range(0, count, step)):
-        size = min(step, count - first)
-        sampler.seed(seed + block * 7919, size * spp)
-        index = dr.arange(mi.UInt32, size * spp) // per_point + dr.opaque(mi.UInt32, first)
-        si = dr.zeros(mi.SurfaceInteraction3f, size * spp)
+
+    def interaction(index):
+        si = dr.zeros(mi.SurfaceInteraction3f, dr.width(index))
         si.p = dr.gather(mi.Point3f, positions, index)
         si.n = dr.gather(mi.Normal3f, geometric, index)
-        normal = dr.gather(mi.Normal3f, normals, index)
-        si.sh_frame = mi.Frame3f(normal)
-        sample, weight = mi_scene.sample_emitter_direction(si, sampler.next_2d(), True)
-        value = mi.Color3f(weight) * dr.maximum(dr.dot(normal, sample.d), 0)
-        sums = [dr.block_sum(channel, spp) for channel in value]
-        squares = [dr.block_sum(channel * channel, spp) for channel in value]
-        dr.eval(sums, squares)
-        mean = np.stack([np.array(x, dtype=np.float64) for x in sums], axis=-1) / spp
-        square = np.stack([np.array(x, dtype=np.float64) for x in squares], axis=-1) / spp
-        block = slice(first, first + size)
-        means[block] = mean
-        errors[block] = np.sqrt(np.maximum(square - mean * mean, 0) / max(spp - 1, 1))
-    return Reference(means, errors)
+        si.sh_frame = mi.Frame3f(dr.gather(mi.Normal3f, normals, index))
+        return si
+
+    return interaction
+
+
+def _received(si, sample, weight):
+    """Irradiance of a sample of an emitter; none from a light in the point itself, which has no direction."""
+    import drjit as dr
+
+    value = mitsuba().Color3f(weight) * dr.maximum(dr.dot(si.sh_frame.n, sample.d), 0)
+    return dr.select(dr.isfinite(value), value, 0)
 
 
 def image(mi_scene, sensor, spp, seed=0, max_depth=2):

@@ -6,6 +6,7 @@ counted at its peak. Energy is exact, and a constant map gives the same constant
 
 import numpy as np
 
+from ..errors import LightError
 from .light import as_light
 
 SAMPLES_PER_CELL_SIDE = 16  # cell edges then cut the map to 1/16 of a cell
@@ -16,8 +17,9 @@ def cell_radiance(light, directions, samples_per_side=SAMPLES_PER_CELL_SIDE):
 
     Parameters
     ----------
-    light : DistantLight or what `as_light` accepts
-    directions : Cubemap
+    light : what `as_light` accepts
+        Without local lights: those have no place on a lattice of directions, see `local.arrival`.
+    directions : direction lattice
     samples_per_side : int
         Least number of samples along the side of a cell.
 
@@ -25,8 +27,15 @@ def cell_radiance(light, directions, samples_per_side=SAMPLES_PER_CELL_SIDE):
     -------
     (s, 3) float32
         W/(m²·sr). Σ_j w_j L_j equals the light's energy ∫ L dω to rounding.
+
+    Raises
+    ------
+    LightError
+        If there are local lights.
     """
     light = as_light(light)
+    if light.points:
+        raise LightError("a local light shines from another direction at each point: pass it to Asset.irradiance or relight")
     radiance = np.zeros((len(directions), 3))
     spacing = np.sqrt(4 * np.pi / len(directions)) / samples_per_side
     for environment in light.maps:
@@ -48,7 +57,7 @@ def average(quadrature, directions):
     Parameters
     ----------
     quadrature : iterable of (vectors (k, 3), solid_angles (k,), radiance (k, 3))
-    directions : Cubemap
+    directions : direction lattice
 
     Returns
     -------

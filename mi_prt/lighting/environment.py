@@ -66,6 +66,26 @@ class EnvironmentMap:
         object.__setattr__(turned, "rotation", rotation_matrix(axis, degrees) @ self.rotation)
         return turned
 
+    @property
+    def size(self):
+        """Rows and columns."""
+        return self.pixels.shape[:2]
+
+    def at(self, vectors):
+        """Radiance (k, 3) that arrives from unit directions (k, 3) in world space, bilinear as in Mitsuba."""
+        height, width = self.size
+        x, y, z = (vectors @ self.rotation).T
+        column = np.arctan2(x, -z) * (width / (2 * np.pi)) - 0.5
+        row = np.arctan2(np.hypot(x, z), y) * ((height - 1) / np.pi)
+        left = np.floor(column).astype(np.int64)
+        above = np.minimum(row.astype(np.int64), max(height - 2, 0))
+        below = np.minimum(above + 1, height - 1)
+        weight_u, weight_v = (column - left)[:, None], (row - above)[:, None]
+        left, right = left % width, (left + 1) % width
+        upper = self.pixels[above, left] * (1 - weight_u) + self.pixels[above, right] * weight_u
+        lower = self.pixels[below, left] * (1 - weight_u) + self.pixels[below, right] * weight_u
+        return upper * (1 - weight_v) + lower * weight_v
+
     def quadrature(self, spacing, band=1 << 20):
         """Samples that integrate the map over the sphere, in bands of rows so that memory stays bounded.
 

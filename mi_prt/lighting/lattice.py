@@ -10,11 +10,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..directions import Cubemap
 from ..parallel import one_blas_thread
 from .cells import cell_radiance
 from .environment import rotation_matrix
-from .light import DistantLight, as_light
+from .light import Light, as_light
 
 REFINEMENT = 4  # fine cells along the side of a cell of the asset
 SAMPLES_PER_FINE_SIDE = 4
@@ -26,18 +25,28 @@ class LatticeMap:
 
     Parameters
     ----------
-    directions : Cubemap
+    directions : direction lattice
     radiance : (s, 3) float32
     rotation : (3, 3) float64
     """
 
-    directions: Cubemap
+    directions: object
     radiance: np.ndarray
     rotation: np.ndarray
 
     def rotated(self, axis, degrees):
         """The same light turned about `axis` (x, y, z or a vector of 3) by `degrees`, right-handed."""
         return replace(self, rotation=rotation_matrix(axis, degrees) @ self.rotation)
+
+    @property
+    def size(self):
+        """Rows and columns of an equirectangular map whose pixels are about as large as the cells."""
+        height = max(2, round(np.sqrt(np.pi / 4 * len(self.directions))))
+        return height, 2 * height
+
+    def at(self, vectors):
+        """Radiance (k, 3) that arrives from unit directions (k, 3) in world space: that of their cells."""
+        return self.radiance[self.directions.cells(vectors @ self.rotation)]
 
     def quadrature(self, spacing):
         """The cells as samples that cover the sphere, in one band; see `EnvironmentMap.quadrature`."""
@@ -52,17 +61,19 @@ def on_lattice(light, directions, refinement=REFINEMENT):
     Parameters
     ----------
     light : what `as_light` accepts
-    directions : Cubemap
-        The asset's lattice.
+    directions : direction lattice
+        That of the asset.
     refinement : int
         Fine cells along the side of a cell; more cost more and place light more exactly.
 
     Returns
     -------
-    DistantLight
-        Whose `rotated` and projection take a few milliseconds.
+    Light
+        Whose `rotated` and projection take a few milliseconds. Directional and local lights are as they were.
     """
     light = as_light(light)
-    fine = Cubemap(directions.resolution * refinement)
-    radiance = cell_radiance(DistantLight(maps=light.maps), fine, SAMPLES_PER_FINE_SIDE)
-    return DistantLight((LatticeMap(fine, radiance, np.eye(3)),), light.directionals)
+    if not light.maps:
+        return light
+    fine = directions.refined(refinement)
+    radiance = cell_radiance(Light(light.maps), fine, SAMPLES_PER_FINE_SIDE)
+    return replace(light, maps=(LatticeMap(fine, radiance, np.eye(3)),))

@@ -1,6 +1,6 @@
-"""Distant light of any kind: a sum of environment maps and directional lights, and what counts as one."""
+"""Light of any kind, distant and local: what counts as light, and sums of it."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -16,8 +16,8 @@ class DirectionalLight:
     ----------
     direction : (3,) array
         Direction in which the light travels (Mitsuba's `direction`), any positive length.
-    irradiance : (3,) array
-        Irradiance on a surface that faces the light, RGB in W/m².
+    irradiance : (3,) array or float
+        Irradiance on a surface that faces the light, RGB in W/m²; one number is grey.
 
     Raises
     ------
@@ -29,15 +29,12 @@ class DirectionalLight:
     irradiance: np.ndarray
 
     def __post_init__(self):
-        direction = np.asarray(self.direction, dtype=np.float64)
-        irradiance = np.asarray(self.irradiance, dtype=np.float64)
+        direction = _numbers(self.direction)
         length = np.linalg.norm(direction) if direction.shape == (3,) else 0.0
         if not (np.isfinite(length) and length > 0):
             raise LightError(f"a light's direction must be three numbers and not zero, got {self.direction}")
-        if irradiance.shape != (3,) or not np.isfinite(irradiance).all() or (irradiance < 0).any():
-            raise LightError(f"a light's irradiance must be three finite numbers ≥ 0, got {self.irradiance}")
         object.__setattr__(self, "direction", direction / length)
-        object.__setattr__(self, "irradiance", irradiance)
+        object.__setattr__(self, "irradiance", _rgb("irradiance", self.irradiance))
 
     def rotated(self, axis, degrees):
         """The same light turned about `axis` (x, y, z or a vector of 3) by `degrees`, right-handed."""
@@ -45,42 +42,106 @@ class DirectionalLight:
 
 
 @dataclass(frozen=True, eq=False)
-class DistantLight:
-    """The sum of any number of environment maps and directional lights.
+class PointLight:
+    """Light from a single place, equal in all directions (Mitsuba's `point`).
+
+    Parameters
+    ----------
+    position : (3,) array
+        World space, m.
+    intensity : (3,) array or float
+        RGB in W/sr; one number is grey. A surface that faces the light at a distance of r metres receives
+        intensity/r² W/m².
+
+    Raises
+    ------
+    LightError
+        If a value is not finite or the intensity negative.
+    """
+
+    position: np.ndarray
+    intensity: np.ndarray
+
+    def __post_init__(self):
+        position = _numbers(self.position)
+        if position.shape != (3,) or not np.isfinite(position).all():
+            raise LightError(f"a light's position must be three finite numbers, got {self.position}")
+        object.__setattr__(self, "position", position)
+        object.__setattr__(self, "intensity", _rgb("intensity", self.intensity))
+
+
+@dataclass(frozen=True, eq=False)
+class Light:
+    """The sum of any number of environment maps, directional lights and point lights.
 
     Parameters
     ----------
     maps : tuple of EnvironmentMap
     directionals : tuple of DirectionalLight
+    points : tuple of PointLight
     """
 
     maps: tuple = field(default=())
     directionals: tuple = field(default=())
+    points: tuple = field(default=())
+
+    @property
+    def distant(self):
+        """The same without its local lights."""
+        return replace(self, points=())
 
     def rotated(self, axis, degrees):
-        """The same light turned about `axis` (x, y, z or a vector of 3) by `degrees`, right-handed."""
-        return DistantLight(
-            tuple(m.rotated(axis, degrees) for m in self.maps),
-            tuple(d.rotated(axis, degrees) for d in self.directionals),
+        """The same light turned about `axis` (x, y, z or a vector of 3) by `degrees`, right-handed.
+
+        Distant light turns; local lights stay where they are.
+        """
+        return replace(
+            self,
+            maps=tuple(m.rotated(axis, degrees) for m in self.maps),
+            directionals=tuple(d.rotated(axis, degrees) for d in self.directionals),
         )
 
 
 def as_light(light):
-    """What the user passed as light, as a DistantLight.
+    """What the user passed as light, as one Light.
 
     Parameters
     ----------
-    light : DistantLight, EnvironmentMap, DirectionalLight, path, (h, w, 3) array or mi.Bitmap
+    light : Light, EnvironmentMap, DirectionalLight, PointLight, path, (h, w, 3) array, mi.Bitmap, or list or tuple of these
+        A list is the sum of its entries, which may be lists themselves.
 
     Raises
     ------
     LightError
-        If it is none of these, or see EnvironmentMap.
+        If it is none of these, the list is empty, or see EnvironmentMap.
     """
-    if isinstance(light, DistantLight):
+    if isinstance(light, Light):
         return light
     if isinstance(light, DirectionalLight):
-        return DistantLight(directionals=(light,))
+        return Light(directionals=(light,))
+    if isinstance(light, PointLight):
+        return Light(points=(light,))
     if isinstance(light, EnvironmentMap):
-        return DistantLight(maps=(light,))
-    return DistantLight(maps=(EnvironmentMap(light),))
+        return Light(maps=(light,))
+    if not isinstance(light, list | tuple):
+        return Light(maps=(EnvironmentMap(light),))
+    if not light:
+        raise LightError("the list of lights is empty: pass one light at least")
+    parts = [as_light(part) for part in light]
+    return Light(*(sum((getattr(part, kind) for part in parts), ()) for kind in ("maps", "directionals", "points")))
+
+
+def _rgb(what, value):
+    """One number or three as (3,) float64, finite and not negative."""
+    rgb = _numbers(value)
+    if rgb.shape not in ((), (3,)) or not np.isfinite(rgb).all() or (rgb < 0).any():
+        raise LightError(f"a light's {what} must be one or three finite numbers ≥ 0, got {value}")
+    return np.broadcast_to(rgb, 3).copy()
+
+
+def _numbers(value):
+    """As float64; an array of no entries if it is none."""
+    try:
+        return np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        return np.empty(0)

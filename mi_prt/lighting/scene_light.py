@@ -8,13 +8,15 @@ from ..runtime import mitsuba
 from ..scene.scene import rebuilt_scene
 from ..scene.traversal import children, transform_of
 from .environment import EnvironmentMap
-from .light import DirectionalLight, DistantLight, as_light
+from .light import DirectionalLight, Light, as_light
 
 BAKED_HEIGHT = 512  # rows of the map that an analytic sky is baked to
 SKY_SAMPLES = 8  # samples of every pixel
 SUN_SAMPLES = 1 << 24  # samples shared by the pixels in which a sun was found
 MOST_SUN_SAMPLES = 1 << 16  # samples of one of them
 SUN_SEARCH = 1 << 16  # emitter samples that look for a sun
+SUM_REFINEMENT = 3  # of the grid on which unlike maps are summed; odd, so that its nodes hold those of the largest map
+BAND = 1 << 20  # pixels resampled at a time
 
 
 def scene_light(scene):
@@ -26,7 +28,7 @@ def scene_light(scene):
 
     Returns
     -------
-    DistantLight
+    Light
 
     Raises
     ------
@@ -39,7 +41,7 @@ def scene_light(scene):
 
 
 def emitters_light(emitters):
-    """The sum of some distant emitters as DistantLight; see `scene_light`."""
+    """The sum of some distant emitters as Light; see `scene_light`."""
     maps, directionals = [], []
     for emitter in emitters:
         kind = emitter.class_name()
@@ -52,26 +54,25 @@ def emitters_light(emitters):
             maps.append(EnvironmentMap(np.broadcast_to(radiance, (2, 4, 3))))
         else:
             maps.append(_baked(emitter))
-    return DistantLight(tuple(maps), tuple(directionals))
+    return Light(tuple(maps), tuple(directionals))
 
 
 def lit_scene(mi_scene, light=None):
-    """The same shapes and sensors as a new mi.Scene under other distant light, with watertight intersections.
+    """The same shapes and sensors as a new mi.Scene under other light, with watertight intersections.
 
     Parameters
     ----------
     mi_scene : mi.Scene
-    light : DistantLight or what `as_light` accepts, optional
-        Takes the place of the scene's distant emitters; by default they stay.
+    light : what `as_light` accepts, optional
+        Takes the place of the scene's distant emitters; by default they stay. Local emitters of the scene stay in any case.
 
     Returns
     -------
     mi.Scene
 
-    Raises
-    ------
-    LightError
-        If the light has more than one environment map: Mitsuba takes one.
+    Notes
+    -----
+    Mitsuba takes one environment map, so several become one, see `summed_maps`.
     """
     mi = mitsuba()
     kept = []
@@ -89,16 +90,17 @@ def turned_light(scene, light=None, rotate=None):
     Parameters
     ----------
     scene : Scene or None
-        Whose own light is taken where `light` is None; not needed otherwise.
+        Whose own distant light is taken where `light` is None; not needed otherwise.
     light : what `as_light` accepts, optional
     rotate : (axis, degrees), optional
+        Turns the distant light.
 
     Returns
     -------
-    shown : DistantLight or None
+    shown : Light or None
         What replaces the scene's distant emitters; None where they stay.
-    cells_light : DistantLight
-        What is projected on the asset's lattice.
+    chosen : Light
+        What the asset is lit by.
     """
     chosen = scene_light(scene) if light is None else as_light(light)
     if rotate is not None:
@@ -106,13 +108,48 @@ def turned_light(scene, light=None, rotate=None):
     return (None if light is None and rotate is None else chosen), chosen
 
 
+def summed_maps(maps):
+    """One map in place of several.
+
+    Maps of one size and rotation are summed pixel by pixel. Others are resampled to a grid three times finer than the
+    largest of them and turned like it. The largest is then kept exactly and constants are too; of the others, interpolation
+    changes the energy by 1e-5 in smooth maps, 4e-4 in noise, and up to 2 % in a sun of a single pixel.
+
+    Parameters
+    ----------
+    maps : sequence of EnvironmentMap or LatticeMap
+
+    Returns
+    -------
+    EnvironmentMap
+    """
+    largest = max(maps, key=lambda environment: np.prod(environment.size))
+    if all(_is_alike(environment, largest) for environment in maps):
+        return maps[0] if len(maps) == 1 else EnvironmentMap(sum(m.pixels for m in maps), largest.rotation)
+    height, width = largest.size
+    height, width = SUM_REFINEMENT * max(height - 1, 1) + 1, SUM_REFINEMENT * width
+    pixels = np.empty((height, width, 3), np.float32)
+    step = max(1, BAND // width)
+    for first in range(0, height, step):
+        rows, columns = np.indices((min(step, height - first), width)).reshape(2, -1)
+        rows = np.clip(rows + first, 1e-6, height - 1 - 1e-6)  # beside a pole: in it, all columns would be one direction
+        vectors = _pixel_directions(rows, columns, height, width) @ largest.rotation.T
+        pixels[first : first + step] = sum(m.at(vectors) for m in maps).reshape(-1, width, 3)
+    return EnvironmentMap(pixels, largest.rotation)
+
+
+def _is_alike(one, other):
+    """Whether two maps have pixels in the same directions."""
+    both_pixels = isinstance(one, EnvironmentMap) and isinstance(other, EnvironmentMap)
+    return both_pixels and one.size == other.size and np.allclose(one.rotation, other.rotation, rtol=0, atol=1e-9)
+
+
 def _emitters(light):
-    """Mitsuba emitter dicts of a DistantLight."""
+    """Mitsuba emitter dicts of a Light."""
     mi = mitsuba()
-    if len(light.maps) > 1:
-        raise LightError(f"the light has {len(light.maps)} environment maps, Mitsuba takes one: add their pixels first")
     emitters = {}
-    for environment in light.maps:
+    if light.maps:
+        environment = summed_maps(light.maps)
         to_world = np.eye(4)
         to_world[:3, :3] = environment.rotation
         emitters["environment"] = {
@@ -124,9 +161,24 @@ def _emitters(light):
         emitters[f"directional{i}"] = {
             "type": "directional",
             "direction": [float(x) for x in source.direction],
-            "irradiance": {"type": "rgb", "value": [float(x) for x in source.irradiance]},
+            "irradiance": _spectrum(source.irradiance),
         }
+    for i, source in enumerate(light.points):
+        emitters[f"point{i}"] = point_emitter(source)
     return emitters
+
+
+def point_emitter(light):
+    """Mitsuba emitter dict of a PointLight."""
+    return {
+        "type": "point",
+        "position": [float(x) for x in light.position],
+        "intensity": _spectrum(light.intensity),
+    }
+
+
+def _spectrum(rgb):
+    return {"type": "rgb", "value": [float(x) for x in rgb]}
 
 
 def _directional(emitter):
@@ -186,17 +238,23 @@ def _pixel_means(emitter, pixels, height, samples):
     for chunk in np.array_split(offsets, max(1, len(pixels) * len(offsets) >> 20)):
         rows = pixels[:, None, 0] + chunk[None, :, 0]
         columns = pixels[:, None, 1] + chunk[None, :, 1]
-        theta = rows * (np.pi / (height - 1))
-        phi = (columns + 0.5) * (np.pi / height)
-        sine = np.maximum(np.sin(theta), 0)  # beyond the poles there is nothing
-        directions = np.stack([np.sin(phi) * sine, np.cos(theta), -np.cos(phi) * sine], axis=-1)
+        directions = _pixel_directions(rows, columns, height, 2 * height)
         radiance = _evaluate(emitter, directions.reshape(-1, 3)).reshape(*rows.shape, 3)
+        sine = np.hypot(directions[..., 0], directions[..., 2])
         weight = sine * (1 - np.abs(chunk)).prod(axis=1)
         sums = sums + (radiance * weight[..., None]).sum(axis=1)
         weights = weights + weight.sum(axis=1)[:, None]
         largest = np.maximum(largest, radiance.max(axis=(1, 2)))
     means = sums / np.maximum(weights, 1e-12)
     return means, (largest / np.maximum(means.max(axis=1), 1e-12))[:, None]
+
+
+def _pixel_directions(rows, columns, height, width):
+    """Directions (…, 3) in which a map of a size shows some of its pixels, or places between them, in its own frame."""
+    theta = rows * (np.pi / (height - 1))
+    phi = (columns + 0.5) * (2 * np.pi / width)
+    sine = np.maximum(np.sin(theta), 0)  # beyond the poles there is nothing
+    return np.stack([np.sin(phi) * sine, np.cos(theta), -np.cos(phi) * sine], axis=-1)
 
 
 def _pixel_of(directions, height):

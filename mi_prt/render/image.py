@@ -11,8 +11,8 @@ from .integrator import integrator_for
 MAX_PIXELS = 1 << 26
 
 
-def render_image(asset, mi_scene, sensor, spp=64, seed=0):
-    """Image of a scene lit from an asset by its distant emitters.
+def render_image(asset, mi_scene, sensor, spp=64, seed=0, irradiance=None):
+    """Image of a scene lit from an asset.
 
     Parameters
     ----------
@@ -22,14 +22,16 @@ def render_image(asset, mi_scene, sensor, spp=64, seed=0):
     spp : int
         Samples per pixel; they antialias, there is no other noise.
     seed : int
+    irradiance : (n, 3), optional
+        W/m² at the asset's points; by default that under the scene's distant emitters.
 
     Returns
     -------
     (h, w, 3) float32
         Linear radiance.
     """
-    rendered = mitsuba().render(mi_scene, sensor=sensor, integrator=integrator_for(asset), spp=spp, seed=seed)
-    return np.array(rendered)[..., :3]
+    integrator = integrator_for(asset, irradiance)
+    return np.array(mitsuba().render(mi_scene, sensor=sensor, integrator=integrator, spp=spp, seed=seed))[..., :3]
 
 
 def pick_sensor(mi_scene, index):

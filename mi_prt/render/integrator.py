@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 
 from ..asset import load
-from ..errors import InputError
+from ..errors import InputError, SettingsError
 from ..lighting.scene_light import scene_light
 from ..points.locate import PatchLocator
 from ..runtime import VARIANTS, mitsuba
@@ -61,11 +61,13 @@ def _plugin_class(variant):
             When rendering a scene without distant emitters.
         """
 
-        def __init__(self, properties, asset=None):
+        def __init__(self, properties, asset=None, irradiance=None):
             super().__init__(properties)
             self.asset = asset or _load(str(properties["filename"]))
             self._keep = mi.Float(np.where(self.asset.buried, 0.0, 1.0).astype(np.float32))
-            self._scene = self._light = self._irradiance = None
+            self._follows_emitters = irradiance is None
+            self._irradiance = None if irradiance is None else mi.Float(irradiance.ravel())
+            self._scene = self._light = None
 
         def render(self, scene, sensor=0, *arguments, **named):
             self._prepare(scene)
@@ -78,7 +80,7 @@ def _plugin_class(variant):
                 self._scene = None  # until the new one is known to fit
                 self._locator = PatchLocator(opened, self.asset.points)
                 self._wrapped, self._scene, self._light = opened, scene, None
-            light = _fingerprint(self._wrapped.distant_emitters)
+            light = _fingerprint(self._wrapped.distant_emitters) if self._follows_emitters else None
             if self._light != light:
                 irradiance = self.asset.irradiance(scene_light(self._wrapped))
                 self._irradiance = mi.Float(irradiance.ravel())
@@ -144,15 +146,30 @@ def _plugin_class(variant):
     return PRTIntegrator
 
 
-def integrator_for(asset):
+def integrator_for(asset, irradiance=None):
     """The integrator for an asset in memory.
+
+    Parameters
+    ----------
+    asset : Asset
+    irradiance : (n, 3), optional
+        W/m² at the asset's points; by default that under the distant emitters of the scene it renders.
 
     Returns
     -------
     mi.Integrator
+
+    Raises
+    ------
+    SettingsError
+        If the irradiance is of another shape.
     """
     mi = mitsuba()
-    return _plugin_class(mi.variant())(mi.Properties("prt"), asset)
+    if irradiance is not None:
+        irradiance = np.asarray(irradiance, dtype=np.float32)
+        if irradiance.shape != (len(asset.points), 3):
+            raise SettingsError(f"irradiance must be of shape ({len(asset.points)}, 3), got {irradiance.shape}")
+    return _plugin_class(mi.variant())(mi.Properties("prt"), asset, irradiance)
 
 
 def _load(filename):

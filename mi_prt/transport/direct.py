@@ -1,9 +1,10 @@
 """Direct transport T_ij = V·max(0, n·ω) (Eigentransport, eq. 1), sampled by ray queries and kept as visibility bits."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ..parallel import BLOCK_ROWS, map_chunks
 from ..runtime import mitsuba
 
 LANES = 1 << 22  # rays of a wavefront: a few million keep both cores busy in a few hundred MB
@@ -24,7 +25,7 @@ class DirectTransport:
     vectors : (r, s/2, 3) float32
         The r directions sampled in each cell of the first half of the lattice, scaled by the share of the cell's solid
         angle that each stands for. The cells of the second half are their antipodes.
-    bits : (n, ceil(s·r/16)) uint8
+    bits : (n, ceil(s·r/16)) uint8, array or RowFile
         Visibility along each of `vectors` or its opposite, whichever is above the horizon; packed in their order.
     rays : int
         Rays traced.
@@ -65,45 +66,72 @@ class DirectTransport:
         np.subtract(rows[:, :half], seen, out=rows[:, half:])
         return rows
 
-    def blocks(self, size=128):
-        """All rows in order, `size` at a time."""
-        for first in range(0, len(self.normals), size):
-            yield self.rows(slice(first, first + size))
+    def __getitem__(self, index):
+        return self.rows(index)
+
+    def __matmul__(self, light):
+        """Product (n, k) float32 with a matrix (s, k), block by block."""
+        starts = range(0, len(self.normals), BLOCK_ROWS)
+        return np.concatenate(list(map_chunks(lambda i: self.rows(slice(i, i + BLOCK_ROWS)) @ light, starts)))
 
     def irradiance(self, radiance, solid_angles):
         """Irradiance (n, 3) under cell radiance (s, 3): what no basis has touched."""
-        weighted = (radiance * solid_angles[:, None]).astype(np.float32)
-        return np.concatenate([block @ weighted for block in self.blocks()])
+        return self @ (radiance * solid_angles[:, None]).astype(np.float32)
+
+    def in_memory(self):
+        """The same with all bits in memory."""
+        return replace(self, bits=np.array(self.bits[:]))
+
+    def dark(self):
+        """Which points (n,) see no direction at all."""
+        step = 1 << 14
+        return np.concatenate([~self.bits[slice(i, i + step)].any(axis=1) for i in range(0, len(self.normals), step)])
 
 
-def sample_direct(scene, points, directions, rays_per_direction=1, progress=lambda done, total: None):
-    """Trace the direct transport of all points.
+class DirectSampler:
+    """Traces the direct transport of a scene's points, block by block.
 
     Parameters
     ----------
     scene : Scene
     points : Points
-    directions : Cubemap
+    directions : DirectionLattice
     rays_per_direction : int
         Rays in each cell; more of them antialias visibility.
-    progress : callable(done, total)
-        Called after every block of points.
+    lanes : int
+        Most rays of one wavefront. Results do not depend on it.
+    """
+
+    def __init__(self, scene, points, directions, rays_per_direction=1, lanes=LANES):
+        vectors, fractions = directions.subdivided(rays_per_direction)
+        half = len(directions) // 2
+        vectors, fractions = vectors[:half].swapaxes(0, 1), fractions[:half].T
+        self._normals = points.normals
+        self._vectors = vectors * fractions[..., None]
+        self._tracer = VisibilityTracer(scene, points, vectors.reshape(-1, 3))
+        self._step = max(1, lanes // self._tracer.lanes_per_point)
+        self.rays_per_point = self._tracer.lanes_per_point
+        self.row_bytes = -(-self.rays_per_point // 8)
+
+    def blocks(self, first=0):
+        """Visibility bits (b, row_bytes) uint8 of all points from `first` on, in order."""
+        count = len(self._normals)
+        return self._tracer.stream((i, min(self._step, count - i)) for i in range(first, count, self._step))
+
+    def transport(self, bits):
+        """The transport matrix of the bits of all points: an array, or what gives arrays when it is indexed."""
+        return DirectTransport(self._normals, self._vectors, bits, len(self._normals) * self.rays_per_point)
+
+
+def sample_direct(scene, points, directions, rays_per_direction=1):
+    """Trace the direct transport of all points into memory; see `DirectSampler`.
 
     Returns
     -------
     DirectTransport
     """
-    vectors, fractions = directions.subdivided(rays_per_direction)
-    half = len(directions) // 2
-    vectors, fractions = vectors[:half].swapaxes(0, 1), fractions[:half].T
-    tracer = VisibilityTracer(scene, points, vectors.reshape(-1, 3))
-    step = max(1, LANES // tracer.lanes_per_point)
-    packed = []
-    for bits in tracer.stream((first, min(step, len(points) - first)) for first in range(0, len(points), step)):
-        packed.append(bits)
-        progress(sum(map(len, packed)), len(points))
-    rays = len(points) * tracer.lanes_per_point
-    return DirectTransport(points.normals, vectors * fractions[..., None], np.concatenate(packed), rays)
+    sampler = DirectSampler(scene, points, directions, rays_per_direction)
+    return sampler.transport(np.concatenate(list(sampler.blocks())))
 
 
 class VisibilityTracer:

@@ -1,13 +1,12 @@
-"""Direction lattices: unit vectors that partition the sphere into cells of known solid angle."""
+"""The cells of an equi-angular cubemap."""
 
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from .errors import SettingsError
-
-MAX_CUBEMAP_RESOLUTION = 512  # 1.6 million directions: beyond any transport matrix this program could hold
+from ..errors import SettingsError
+from .lattice import MAX_CUBEMAP_RESOLUTION, DirectionLattice, is_integer_in, near_square
 
 # Frame of each cube face: its rows are the axes of the face coordinates (a, b) and the outward normal. The faces −x, −y, −z
 # are the point reflections of +x, +y, +z, so that cell j + s/2 is the antipode of cell j.
@@ -23,13 +22,12 @@ _FACES = np.concatenate([_POSITIVE_FACES, -_POSITIVE_FACES])
 
 
 @dataclass(frozen=True)
-class Cubemap:
+class Cubemap(DirectionLattice):
     """Equi-angular cubemap lattice with 6·N·N cells.
 
     The cells of a face are equally wide in angle, not in the face's plane, so that the solid angles of one
     map differ by at most √2 instead of 5.2 and the resolution is the same in the middle of a face and at its
-    corners. Cell index: (face·N + row)·N + column, faces in the order +x, +y, +z, −x, −y, −z. The lattice is symmetric
-    about the origin: direction j + s/2 is the opposite of direction j.
+    corners. Cell index: (face·N + row)·N + column, faces in the order +x, +y, +z, −x, −y, −z.
 
     Parameters
     ----------
@@ -39,13 +37,13 @@ class Cubemap:
     Raises
     ------
     SettingsError
-        If the resolution is outside 1…512.
+        If the resolution is not an integer in 1…512.
     """
 
     resolution: int
 
     def __post_init__(self):
-        if not 1 <= self.resolution <= MAX_CUBEMAP_RESOLUTION:
+        if not is_integer_in(self.resolution, 1, MAX_CUBEMAP_RESOLUTION):
             raise SettingsError(
                 f"cubemap resolution {self.resolution} is outside 1…{MAX_CUBEMAP_RESOLUTION}: use for example cubemap:32"
             )
@@ -57,32 +55,13 @@ class Cubemap:
         return 6 * self.resolution**2
 
     @cached_property
-    def vectors(self):
-        """Unit vectors through the cell centres, (s, 3) float32."""
-        return self.subdivided(1)[0][:, 0]
-
-    @cached_property
     def solid_angles(self):
-        """Exact solid angles of the cells, (s,) float64 in sr, sum 4π."""
+        """Exact solid angles of the cells, (s,) float64 in sr."""
         return _cell_solid_angles(self.resolution, self.resolution).ravel()
 
     def subdivided(self, rays):
-        """Split every cell into `rays` sub-cells, as square as the number allows.
-
-        Parameters
-        ----------
-        rays : int
-            Number of sub-cells r of a cell.
-
-        Returns
-        -------
-        vectors : (s, r, 3) float32
-            Unit vectors through the centres of the sub-cells.
-        fractions : (s, r) float32
-            Share of the cell's solid angle that each sub-cell has; rows sum to 1.
-        """
-        rows = max(i for i in range(1, int(rays**0.5) + 1) if rays % i == 0)
-        columns = rays // rows
+        """Equi-angular sub-cells, as square as their number allows; see `DirectionLattice.subdivided`."""
+        rows, columns = near_square(rays)
         n = self.resolution
         a = np.tan(np.pi / 4 * _centres(n * columns))
         b = np.tan(np.pi / 4 * _centres(n * rows))
@@ -100,17 +79,7 @@ class Cubemap:
         return by_cell(vectors).astype(np.float32), fractions.astype(np.float32)
 
     def cells(self, vectors):
-        """Index of the cell that each direction falls in.
-
-        Parameters
-        ----------
-        vectors : (k, 3) array
-            Directions of any positive length.
-
-        Returns
-        -------
-        (k,) int64
-        """
+        """Index of the cell that each direction falls in; see `DirectionLattice.cells`."""
         x, y, z = np.ascontiguousarray(vectors.T)
         ax, ay, az = np.abs(x), np.abs(y), np.abs(z)
         on_x = (ax >= ay) & (ax >= az)
@@ -143,24 +112,3 @@ def _cell_solid_angles(rows, columns):
     corner = np.arctan2(a * b, np.sqrt(a * a + b * b + 1))
     face = np.diff(np.diff(corner, axis=0), axis=1)
     return np.broadcast_to(face, (6, rows, columns)).copy()
-
-
-def parse_directions(text):
-    """Direction lattice from its name.
-
-    Parameters
-    ----------
-    text : str or Cubemap
-        ``cubemap:N``; a lattice is returned as it is.
-
-    Raises
-    ------
-    SettingsError
-        If the name is not of that form or N is out of range.
-    """
-    if isinstance(text, Cubemap):
-        return text
-    kind, _, resolution = str(text).partition(":")
-    if kind != "cubemap" or not (resolution.isascii() and resolution.isdigit()):
-        raise SettingsError(f"directions '{text}' are not known: use cubemap:N, for example cubemap:32")
-    return Cubemap(int(resolution))

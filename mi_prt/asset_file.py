@@ -1,0 +1,239 @@
+"""The asset as one self-describing HDF5 file.
+
+The file is read with NumPy and h5py alone; docs/asset-format.md describes it field by field.
+"""
+
+import io
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import scipy.sparse
+
+from .basis.bases import BASES
+from .directions import parse_directions
+from .errors import AssetError
+from .files import replacing
+from .points.lattice import Patches, node_count
+from .points.points import POINT_FIELDS, Points
+from .transport.direct import DirectTransport
+
+FORMAT = "mi_prt asset"
+FORMAT_VERSION = 2
+UNITS = {
+    "points/positions": "m",
+    "points/areas": "m^2",
+    "points/albedo": "1, linear RGB reflectance",
+    "directions/solid_angles": "sr",
+    "basis/mean": "irradiance per unit radiance and steradian (1)",
+    "coefficients": "sr^(1/2); of the basis none: 1",
+    "irradiance": "W/m^2",
+    "outgoing radiance": "W/(m^2 sr)",
+}
+_PATCH_FIELDS = ("levels", "offsets", "nodes", "back")
+_TEXTS = ("scene", "settings", "versions", "report")
+_OVERHEAD = 1 << 20  # bytes of a file beside its arrays: structure, and texts up to that length
+
+
+def write(asset, path):
+    """Write an `Asset` to one file, all or nothing.
+
+    Raises
+    ------
+    SettingsError
+        If the path cannot be written, for example because the disk is full.
+    """
+    import h5py
+
+    arrays = _arrays(asset)
+    texts = {name: json.dumps(getattr(asset, name), sort_keys=True) for name in _TEXTS}
+    size = sum(a.nbytes for a in arrays.values()) + sum(map(len, texts.values())) + _OVERHEAD
+    with replacing(path) as temporary, _ReservedFile(temporary, size) as stream:
+        with h5py.File(stream, "w") as file:
+            file.attrs["format"] = FORMAT
+            file.attrs["format_version"] = FORMAT_VERSION
+            for name, text in texts.items():
+                file.attrs[name] = text
+            file.attrs["units"] = json.dumps(UNITS, sort_keys=True)
+            for name, array in arrays.items():
+                file[name] = array
+            file["points"].attrs["report"] = json.dumps(asset.points.report, sort_keys=True)
+            file["points"].attrs["surfaces"] = json.dumps(asset.points.surfaces, sort_keys=True)
+            file["directions"].attrs["lattice"] = str(asset.directions)
+            file["basis"].attrs["kind"] = asset.basis.kind
+            file.attrs["complete"] = True
+
+
+class _ReservedFile(io.FileIO):
+    """An empty file whose space on the disk is taken before it is written.
+
+    HDF5 ends the process where a disk is full in the middle of a file; this raises OSError before HDF5 comes into it.
+
+    Parameters
+    ----------
+    path : path
+    size : int
+        Bytes that will not be exceeded.
+    """
+
+    def __init__(self, path, size):
+        super().__init__(path, "r+b")
+        self._end = 0
+        try:
+            if hasattr(os, "posix_fallocate"):
+                os.posix_fallocate(self.fileno(), 0, size)
+            else:
+                for first in range(0, size, _OVERHEAD):
+                    super().write(bytes(min(_OVERHEAD, size - first)))
+                super().seek(0)
+        except OSError:
+            super().close()
+            raise
+
+    def seek(self, offset, whence=os.SEEK_SET):
+        return super().seek(offset + self._end, os.SEEK_SET) if whence == os.SEEK_END else super().seek(offset, whence)
+
+    def write(self, content):
+        left = memoryview(content).cast("B")
+        while len(left):  # the system may take less than it is given
+            left = left[super().write(left) :]
+        self._end = max(self._end, self.tell())
+        return len(content)
+
+    def truncate(self, size=None):
+        self._end = self.tell() if size is None else size
+        return self._end
+
+    def close(self):
+        if not self.closed:
+            super().truncate(self._end)
+        super().close()
+
+
+def _arrays(asset):
+    """All arrays of an asset by their paths in the file."""
+    return {
+        **{f"points/{name}": getattr(asset.points, name) for name in POINT_FIELDS},
+        "points/buried": asset.buried,
+        **{f"points/patches/{name}": getattr(asset.points.patches, name) for name in _PATCH_FIELDS},
+        "directions/vectors": asset.directions.vectors,
+        "directions/solid_angles": asset.directions.solid_angles,
+        **{f"basis/{name}": getattr(asset.basis, name) for name in asset.basis.ARRAYS},
+        **coefficient_arrays(asset.coefficients),
+    }
+
+
+def coefficient_arrays(coefficients):
+    """How coefficients are stored: arrays by their paths in the file."""
+    if isinstance(coefficients, DirectTransport):
+        return {"coefficients/visibility": coefficients.bits[:], "coefficients/ray_vectors": coefficients.vectors}
+    if scipy.sparse.issparse(coefficients):
+        n, s = coefficients.shape
+        index = coefficients.indices.reshape(n, -1).astype(np.uint16 if s <= 1 << 16 else np.uint32)
+        return {"coefficients/indices": index, "coefficients/values": coefficients.data.reshape(n, -1)}
+    return {"coefficients": coefficients}
+
+
+def read(path):
+    """Read an asset.
+
+    Parameters
+    ----------
+    path : path
+
+    Returns
+    -------
+    dict
+        The fields of `Asset`.
+
+    Raises
+    ------
+    AssetError
+        If the file is missing, truncated, no asset, or of a format version this program does not know.
+    """
+    import h5py
+
+    path = Path(path)
+    if not path.is_file():
+        raise AssetError(f"asset '{path}' does not exist")
+    try:
+        with h5py.File(path, "r") as file:
+            if file.attrs.get("format") != FORMAT:
+                raise AssetError(f"'{path}' is an HDF5 file but no mi_prt asset: make one with `mi-prt precompute`")
+            version = int(file.attrs["format_version"])
+            if version != FORMAT_VERSION:
+                raise AssetError(
+                    f"asset '{path}' has format version {version}, this program reads {FORMAT_VERSION}: precompute it again"
+                )
+            if not file.attrs.get("complete"):
+                raise AssetError(f"asset '{path}' is incomplete: precompute it again")
+            return _read(file, path)
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        if isinstance(error, AssetError):
+            raise
+        reason = " ".join(str(error).split())
+        raise AssetError(f"'{path}' is truncated or no mi_prt asset ({reason})") from None
+
+
+def _read(file, path):
+    points = file["points"]
+    basis = BASES[file["basis"].attrs["kind"]]
+    basis = basis(**{name: file[f"basis/{name}"][()] for name in basis.ARRAYS})
+    points = Points(
+        **{name: points[name][()] for name in POINT_FIELDS},
+        patches=Patches(**{name: points[f"patches/{name}"][()] for name in _PATCH_FIELDS}),
+        surfaces=tuple(json.loads(points.attrs["surfaces"])),
+        report=json.loads(points.attrs["report"]),
+    )
+    fields = {
+        "points": points,
+        "buried": file["points/buried"][()],
+        "directions": parse_directions(file["directions"].attrs["lattice"]),
+        "basis": basis,
+        "coefficients": _read_coefficients(file, points, len(file["directions/vectors"])),
+        "path": path.absolute(),
+        **{name: json.loads(file.attrs[name]) for name in _TEXTS},
+    }
+    _check_shapes(**{name: fields[name] for name in ("points", "buried", "directions", "basis", "coefficients")})
+    return fields
+
+
+def _read_coefficients(file, points, directions):
+    stored = file["coefficients"]
+    if not hasattr(stored, "keys"):
+        return stored[()]
+    if "visibility" in stored:
+        bits, vectors = stored["visibility"][()], stored["ray_vectors"][()]
+        r, half, _ = vectors.shape
+        if bits.shape != (len(points), -(-r * half // 8)):
+            raise ValueError(f"coefficients/visibility is of shape {bits.shape}")
+        return DirectTransport(points.normals, vectors, bits, len(points) * r * half)
+    values, index = stored["values"][()], stored["indices"][()]
+    if values.shape != index.shape or (index >= directions).any():
+        raise ValueError("coefficients/values and indices do not fit together")
+    n, k = values.shape
+    return scipy.sparse.csr_array((values.ravel(), index.ravel().astype(np.int32), k * np.arange(n + 1)), (n, directions))
+
+
+def _check_shapes(points, buried, directions, basis, coefficients):
+    """Raise ValueError unless the arrays of an asset fit together."""
+    n, s, d = len(points), len(directions), len(basis)
+    patches = points.patches
+    p = len(patches.levels)
+    expected = {
+        **{f"points/{name}": (getattr(points, name), (n, 3)) for name in POINT_FIELDS[:5]},
+        "points/uv": (points.uv, (n, 2)),
+        **{f"points/{name}": (getattr(points, name), (n,)) for name in ("areas", "surface")},
+        "points/buried": (buried, (n,)),
+        "points/patches/levels": (patches.levels, (p, 2)),
+        "points/patches/offsets": (patches.offsets, (p,)),
+        "points/patches/back": (patches.back, (p,)),
+        "points/patches/nodes": (patches.nodes, (int(node_count(*patches.levels.T.astype(np.int64)).sum()),)),
+        "coefficients": (coefficients, (n, s if basis.kind == "haar" else d)),
+    }
+    shapes = {"vectors": (d, s), "mean": (s,), "sqrt_weights": (s,), "weights": (s,), "captured_variance": (d,)}
+    expected |= {f"basis/{name}": (getattr(basis, name), shapes[name]) for name in basis.ARRAYS}
+    for name, (array, shape) in expected.items():
+        if array.shape != shape:
+            raise ValueError(f"{name} is of shape {array.shape} instead of {shape}")

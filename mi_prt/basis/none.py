@@ -1,0 +1,42 @@
+"""No basis at all: transport as it was sampled."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True, eq=False)
+class NoBasis:
+    """Coefficients are the sampled transport itself.
+
+    Parameters
+    ----------
+    weights : (s,) float32
+        Solid angles.
+    """
+
+    weights: np.ndarray
+
+    kind = "none"
+    ARRAYS = ("weights",)
+    captured_variance = np.zeros(0)
+
+    def __len__(self):
+        """Number of coefficients of a point: the directions s."""
+        return len(self.weights)
+
+    def encode(self, rows):
+        """The rows (b, s) themselves."""
+        return rows
+
+    def reconstruct(self, coefficients):
+        """The coefficients (b, s) themselves."""
+        return coefficients
+
+    def at(self, coefficients, cells):
+        """Transport (b, k) float32 of points with coefficients (b, s) in some cells (b, k) of the lattice each."""
+        return np.take_along_axis(coefficients, cells, axis=1)
+
+    def project_light(self, radiance):
+        """Light (s, 3) float32 that irradiance is the product with, and no mean response (3,)."""
+        return (radiance * self.weights[:, None]).astype(np.float32), np.zeros(3, np.float32)

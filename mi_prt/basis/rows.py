@@ -1,0 +1,70 @@
+"""A matrix of transport that is only ever seen in blocks of rows."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..parallel import BLOCK_ROWS, map_chunks
+
+CHUNKS = 16  # parts that the rows are split into for the threads; fixed, so that sums do not depend on their number
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """The rows to fit a basis to, in the √w-weighted space of a direction lattice.
+
+    Parameters
+    ----------
+    read : callable(index) returning (b, s) float32
+        Rows of the transport matrix; the array is the caller's to change.
+    index : (n,) int array
+        The rows to fit to.
+    directions : DirectionLattice
+        Whose solid angles are the weights w.
+    """
+
+    read: Callable
+    index: np.ndarray
+    directions: object
+
+    def __post_init__(self):
+        object.__setattr__(self, "sqrt_weights", np.sqrt(self.directions.solid_angles).astype(np.float32))
+
+    @property
+    def shape(self):
+        """(n, s)."""
+        return len(self.index), len(self.sqrt_weights)
+
+    def blocks(self, index=None):
+        """Blocks of rows, not weighted, in order; of a part of the index if one is given."""
+        index = self.index if index is None else index
+        for first in range(0, len(index), BLOCK_ROWS):
+            yield self.read(index[first : first + BLOCK_ROWS])
+
+    def sums(self, function, index=None):
+        """Sum over chunks of rows of what `function(chunk of the index)` returns, a tuple of arrays or numbers.
+
+        The chunks run on all threads. They are the same for any number of threads and are summed in order, so that results
+        are too.
+        """
+        index = self.index if index is None else index
+        total = None
+        for part in map_chunks(function, np.array_split(index, CHUNKS)):
+            total = part if total is None else tuple(a + b for a, b in zip(total, part))
+        return total
+
+    def moments(self):
+        """Weighted mean (s,) float64 of the rows, and the sum of their weighted squares."""
+
+        def moments(chunk):
+            total = np.zeros(len(self.sqrt_weights))
+            squares = 0.0
+            for block in self.blocks(chunk):
+                total += block.sum(axis=0)
+                block *= self.sqrt_weights
+                squares += float(np.vdot(block, block))
+            return total, squares
+
+        total, squares = self.sums(moments)
+        return total / len(self.index) * self.sqrt_weights, squares

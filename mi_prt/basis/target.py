@@ -1,0 +1,97 @@
+"""What a basis is asked for, and what a fit tells of itself."""
+
+from dataclasses import dataclass
+from numbers import Integral, Real
+
+import numpy as np
+
+from ..errors import SettingsError
+
+ROUNDING = 1e-6  # share of Σ‖T‖² below which a difference of sums of squares of float32 rows is their rounding
+
+
+@dataclass(frozen=True)
+class Target:
+    """How many components are wanted; exactly one of the two is set.
+
+    Parameters
+    ----------
+    components : int, optional
+        Number of components.
+    variance : float, optional
+        As few components as capture this share of the variance, above 0 and below 1.
+
+    Raises
+    ------
+    SettingsError
+        If both or none are set, or one is out of range.
+    """
+
+    components: int | None = None
+    variance: float | None = None
+
+    def __post_init__(self):
+        if (self.components is None) == (self.variance is None):
+            raise SettingsError(
+                f"a basis takes either a number of components or a share of the variance, got components "
+                f"{self.components!r} and variance {self.variance!r}: set exactly one"
+            )
+        components, variance = self.components, self.variance
+        if variance is None and (isinstance(components, bool) or not isinstance(components, Integral) or components < 0):
+            raise SettingsError(f"components must be an integer ≥ 0, got {components!r}")
+        if components is None and not (isinstance(variance, Real) and 0 < variance < 1):
+            raise SettingsError(f"the share of the variance must be above 0 and below 1, got {variance!r}: try 0.99")
+
+    def allowed_residual(self, variance, energy):
+        """Largest Σ‖T − T̂‖² that captures the share of the variance; where nothing varies, what rounding leaves."""
+        return (1 - self.variance) * variance if variance > ROUNDING * energy else ROUNDING * energy
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A basis and how well it represents the rows that it was fitted to, in the √w-weighted norm.
+
+    Parameters
+    ----------
+    basis : LinearBasis or HaarBasis
+    captured_variance : float
+        1 − Σ‖T − T̂‖² / Σ‖T − mean‖², T̂ the reconstruction. Negative where a basis without a mean does worse than the
+        mean alone. Where nothing varies: 1 if nothing is lost, else 0.
+    relative_error : float
+        ‖T − T̂‖ / ‖T‖ over all rows; 0 where all are zero.
+    """
+
+    basis: object
+    captured_variance: float
+    relative_error: float
+
+
+def fit_of(basis, residual, variance, energy):
+    """A Fit from sums over the fitted rows.
+
+    Parameters
+    ----------
+    basis : LinearBasis or HaarBasis
+    residual : float
+        Σ‖T − T̂‖².
+    variance : float
+        Σ‖T − mean‖², see `centred`.
+    energy : float
+        Σ‖T‖².
+    """
+    if variance > ROUNDING * energy:
+        captured = 1 - residual / variance
+    else:
+        captured = float(residual <= ROUNDING * energy)
+    return Fit(basis, float(captured), float(np.sqrt(residual / energy)) if energy else 0.0)
+
+
+def centred(energy, total, count):
+    """Σ‖T − mean‖² from Σ‖T‖² and ΣT (s,), both weighted, of some rows; 0 where it is no more than rounding."""
+    variance = energy - float(total @ total) / max(count, 1)
+    return variance if variance > ROUNDING * energy else 0.0
+
+
+def shares(energies, variance):
+    """Energies (d,) over the variance; 0 where nothing varies."""
+    return energies / variance if variance > 0 else np.zeros(len(energies))

@@ -1,0 +1,65 @@
+"""Local lights from an asset, and how far they are from Mitsuba's."""
+
+import warnings
+
+import numpy as np
+
+from ..lighting.environment import LightWarning
+from ..lighting.light import Light
+from ..lighting.local import hull_warning
+from . import ground_truth, metrics
+
+MEASURED_POINTS = 4096
+
+
+def local_irradiance(asset, lights, nearest=1):
+    """Irradiance (n, 3) float32 in W/m² under local lights alone, without the warning: `measure_error` gives a better one.
+
+    Parameters
+    ----------
+    asset : Asset
+    lights : tuple of PointLight
+    nearest : int
+        Directions that stand for a light, see `Asset.irradiance`.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", LightWarning)
+        return asset.irradiance(Light(points=lights), nearest)
+
+
+def measure_error(asset, lights, irradiance, scene, seed=0):
+    """Measure the error of local lights, and warn with it of those that stand inside the scene's convex hull.
+
+    Parameters
+    ----------
+    asset : Asset
+    lights : tuple of PointLight
+    irradiance : (n, 3)
+        As `local_irradiance` gives it.
+    scene : Scene
+        That of the asset.
+    seed : int
+        Picks the points.
+
+    Returns
+    -------
+    dict
+        relative_rmse and bias (signed, relative) of the irradiance against Mitsuba's at `points` points, 4,096 at most.
+
+    Warns
+    -----
+    LightWarning
+        If a light is inside the hull.
+    """
+    chosen = np.sort(np.random.default_rng(seed).permutation(len(asset.points))[:MEASURED_POINTS])
+    truth = ground_truth.local_irradiance(scene.occluders, asset.points.at(chosen), lights)
+    error = {
+        "relative_rmse": metrics.relative_rmse(irradiance[chosen], truth),
+        "bias": metrics.relative_bias(irradiance[chosen], truth),
+        "points": len(chosen),
+    }
+    warning = hull_warning(lights, asset.points.positions)
+    if warning:
+        measured = f"relative RMSE {error['relative_rmse']:.1%} and bias {error['bias']:+.1%} at {len(chosen):,} points"
+        warnings.warn(f"{warning}: {measured}", LightWarning, stacklevel=3)
+    return error

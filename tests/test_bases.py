@@ -1,0 +1,284 @@
+"""All bases on all lattices through the whole program: fit, file, relighting, rotation, and what `info` says of their storage."""
+
+import json
+
+import h5py
+import numpy as np
+import pytest
+
+import mi_prt
+from conftest import bias, cube, diffuse, disk, rectangle, relative_l2, scene, sky_of
+from mi_prt import AssetError, SettingsError
+from mi_prt.basis.bases import BASES
+from mi_prt.directions import parse_directions
+from mi_prt.evaluate.ground_truth import point_irradiance
+from mi_prt.info import describe, describe_asset
+from mi_prt.lighting.cells import cell_radiance
+from mi_prt.lighting.scene_light import lit_scene
+from mi_prt.scene.scene import open_scene
+from mi_prt.transport.direct import sample_direct
+
+PARTS = dict(
+    floor=rectangle(size=2, bsdf=diffuse(0.6)), box=cube((0.2, 0.4, 0), 0.4), ball=disk((0, 1, 0.1), (0.3, 1.5, 0), 0.6)
+)
+COEFFICIENTS = {"pca": 36, "sh": 36, "haar": 36, "haar-shared": 36, "none": None}
+LATTICES = ("cubemap:16", "latlong:48x24", "halton:1200")
+
+
+def sky():
+    """A smooth sky with a bright and coloured patch about (1, 2, 1)."""
+    toward = np.array([1, 2, 1]) / 6**0.5
+    colour = np.array([3.0, 2.0, 1.0])
+    return mi_prt.EnvironmentMap(sky_of(lambda d: 0.3 + np.exp(8 * (d @ toward - 1))[:, None] * colour))
+
+
+@pytest.fixture(scope="module")
+def assets():
+    """An asset of every basis, on the same points and the same lattice."""
+    return {
+        kind: mi_prt.precompute(scene(**PARTS), directions="cubemap:16", edge_length=0.3, basis=kind, coefficients=coefficients)
+        for kind, coefficients in COEFFICIENTS.items()
+    }
+
+
+@pytest.fixture(scope="module")
+def sampled(assets):
+    """The transport of those points without any basis (n, s), sampled anew."""
+    points = assets["pca"].points
+    transport = sample_direct(open_scene(scene(**PARTS)), points, parse_directions("cubemap:16"))
+    return transport.rows(np.arange(len(points)))
+
+
+def weighted_error(asset, sampled):
+    rows = np.flatnonzero(~asset.buried)
+    w = np.sqrt(asset.directions.solid_angles)
+    return relative_l2(asset.transport(rows) * w, sampled[rows] * w)
+
+
+# --- one protocol --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", BASES)
+def test_irradiance_is_the_response_of_the_reconstruction(assets, kind):
+    """E = Σ_j w_j L_j T̂_j for any basis: projecting light loses nothing more than the transport has lost."""
+    asset = assets[kind]
+    w, radiance = asset.directions.solid_angles, cell_radiance(sky(), asset.directions)
+    expected = asset.transport(np.arange(len(asset.points))) @ (w[:, None] * radiance)
+    assert relative_l2(asset.irradiance(sky()), np.maximum(expected, 0)) < 1e-5
+
+
+@pytest.mark.parametrize("kind", BASES)
+def test_the_reported_error_is_that_of_the_transport(assets, sampled, kind):
+    """Told by the fit from sums of squares, here taken from the reconstruction itself; captured variance likewise."""
+    asset = assets[kind]
+    assert asset.report["relative_error"] == pytest.approx(weighted_error(asset, sampled), rel=2e-3, abs=1e-6)
+    rows = sampled[~asset.buried] * np.sqrt(asset.directions.solid_angles)
+    spread = np.linalg.norm(rows - rows.mean(axis=0)) / np.linalg.norm(rows)
+    captured = 1 - (weighted_error(asset, sampled) / spread) ** 2
+    assert asset.report["captured_variance"] == pytest.approx(captured, abs=1e-3)
+
+
+def test_principal_components_are_the_best_linear_basis(assets, sampled):
+    """At equal count no linear basis has a lower error (Eckart and Young); the best of each row is not linear, and is lower here."""
+    errors = {kind: weighted_error(asset, sampled) for kind, asset in assets.items()}
+    assert errors["pca"] < errors["sh"] and errors["pca"] < errors["haar-shared"]
+    assert errors["haar"] < errors["haar-shared"]
+    assert errors["none"] < 1e-6
+
+
+@pytest.mark.parametrize("components", [4, 9, 25, 100, 169])
+def test_the_theorem_holds_at_every_count(components):
+    """PCA ≤ SH and PCA ≤ shared Haar from a few to many coefficients."""
+    errors = {
+        kind: mi_prt.precompute(
+            scene(**PARTS), directions="cubemap:8", edge_length=0.3, basis=kind, coefficients=components
+        ).report["relative_error"]
+        for kind in ("pca", "sh", "haar-shared")
+    }
+    assert errors["pca"] <= min(errors["sh"], errors["haar-shared"]) + 1e-6
+
+
+@pytest.mark.parametrize("kind", BASES)
+def test_files_of_every_basis(assets, tmp_path, kind):
+    """What is loaded relights as what was saved, bit for bit, and is saved again as the same bytes."""
+    asset = assets[kind]
+    asset.save(tmp_path / "a.prt")
+    loaded = mi_prt.load(tmp_path / "a.prt")
+    assert loaded.basis.kind == kind and len(loaded.basis) == len(asset.basis)
+    np.testing.assert_array_equal(loaded.irradiance(sky()), asset.irradiance(sky()))
+    np.testing.assert_array_equal(loaded.transport(np.arange(20)), asset.transport(np.arange(20)))
+    loaded.save(tmp_path / "b.prt")
+    assert (tmp_path / "a.prt").read_bytes() == (tmp_path / "b.prt").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("kind", "name"),
+    [("haar", "coefficients/indices"), ("haar", "coefficients/values"), ("none", "coefficients/visibility"), ("none", "basis/weights"),
+     ("sh", "basis/vectors"), ("haar-shared", "coefficients")],
+)  # fmt: skip
+def test_arrays_that_do_not_fit_together_are_refused(assets, tmp_path, kind, name):
+    assets[kind].save(tmp_path / "a.prt")
+    with h5py.File(tmp_path / "a.prt", "r+") as file:
+        values = file[name][()]
+        del file[name]
+        file[name] = values[:-1]
+    with pytest.raises(AssetError):
+        mi_prt.load(tmp_path / "a.prt")
+
+
+def test_unknown_bases_and_indices_beyond_the_lattice_are_refused(assets, tmp_path):
+    assets["haar"].save(tmp_path / "a.prt")
+    with h5py.File(tmp_path / "a.prt", "r+") as file:
+        file["coefficients/indices"][3, 3] = 1536
+    with pytest.raises(AssetError, match="indices"):
+        mi_prt.load(tmp_path / "a.prt")
+    assets["pca"].save(tmp_path / "b.prt")
+    with h5py.File(tmp_path / "b.prt", "r+") as file:
+        file["basis"].attrs["kind"] = "wavelets of my own"
+    with pytest.raises(AssetError, match="b.prt"):
+        mi_prt.load(tmp_path / "b.prt")
+
+
+# --- lattices ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("lattice", LATTICES)
+@pytest.mark.parametrize("kind", ["pca", "sh", "none"])
+def test_every_lattice_agrees_with_mitsuba(lattice, kind):
+    """A smooth sky over a scene with shadows: 1,200 to 1,536 cells and 36 coefficients, within 6 % and 1 % of bias; 3 % without a basis."""
+    asset = mi_prt.precompute(
+        scene(**PARTS), directions=lattice, edge_length=0.3, basis=kind, coefficients=COEFFICIENTS[kind], rays_per_direction=2
+    )
+    seen = np.flatnonzero(~asset.buried)
+    truth = point_irradiance(lit_scene(open_scene(scene(**PARTS)).mi_scene, sky()), asset.points.at(seen), 8192)
+    result = asset.irradiance(sky())[seen]
+    assert truth.noise < 0.015
+    assert relative_l2(result, truth.mean) < {"pca": 0.06, "sh": 0.10, "none": 0.03}[kind]
+    assert abs(bias(result, truth.mean)) < 0.01
+
+
+@pytest.mark.parametrize("lattice", ["latlong:48x24", "halton:1200", "cubemap:12"])
+@pytest.mark.parametrize("kind", ["haar", "haar-shared"])
+def test_wavelets_need_their_cubemap(lattice, kind):
+    """Refused before any work, with the nearest resolution that does."""
+    with pytest.raises(SettingsError, match="cubemap:8 or cubemap:16"):
+        mi_prt.precompute(scene(**PARTS), directions=lattice, basis=kind)
+
+
+# --- numbers of coefficients ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["pca", "sh", "haar", "haar-shared"])
+@pytest.mark.parametrize("variance", [0.5, 0.9, 0.97])
+def test_as_few_coefficients_as_capture_the_variance(kind, variance):
+    """And not one less: one fewer (for harmonics one band) misses the share."""
+    settings = dict(directions="cubemap:16", edge_length=0.4, basis=kind)
+    asset = mi_prt.precompute(scene(**PARTS), coefficients="auto", variance=variance, **settings)
+    assert asset.report["captured_variance"] >= variance
+    assert asset.settings["variance"] == variance and asset.settings["coefficients"] == len(asset.basis)
+    fewer = (int(len(asset.basis) ** 0.5) - 1) ** 2 if kind == "sh" else len(asset.basis) - 1
+    if fewer > 0:
+        less = mi_prt.precompute(scene(**PARTS), coefficients=fewer, **settings)
+        assert less.report["captured_variance"] < variance + 1e-6
+
+
+def test_a_search_beyond_the_first_components():
+    """0.9995 of the variance takes more than the 64 components that the search starts from."""
+    asset = mi_prt.precompute(scene(**PARTS), directions="cubemap:16", edge_length=0.2, coefficients="auto", variance=0.9995)
+    assert len(asset.basis) > 64 and asset.report["captured_variance"] >= 0.9995
+    assert asset.basis.captured_variance[:-1].sum() < 0.9995
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [dict(variance=0.9), dict(coefficients=10, variance=0.9), dict(coefficients="auto", variance=1.0), dict(coefficients="auto", variance=0),
+     dict(coefficients="auto", variance=float("nan")), dict(coefficients="auto", variance="x"), dict(coefficients="all"),
+     dict(basis="none", coefficients=10), dict(basis="none", coefficients="auto"), dict(basis="fourier"), dict(basis="sh", coefficients=10),
+     dict(basis="sh", coefficients=0), dict(basis="sh", coefficients=900), dict(basis="haar", coefficients=0), dict(basis=None),
+     dict(basis="haar", coefficients=385)],
+    ids=str,
+)  # fmt: skip
+def test_bad_settings(bad):
+    """One line, before any work, that names what was asked for."""
+    with pytest.raises(SettingsError) as caught:
+        mi_prt.precompute(scene(**PARTS), directions="cubemap:8", **bad)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("kind", "lattice"), [("pca", "cubemap:1"), ("sh", "cubemap:1"), ("haar", "cubemap:1"), ("sh", "halton:6")])
+def test_defaults_fit_small_lattices(kind, lattice):
+    """The default number falls to what there is; it never refuses."""
+    asset = mi_prt.precompute(scene(**PARTS), directions=lattice, edge_length=0.8, basis=kind)
+    assert 0 < len(asset.basis) <= 6
+
+
+# --- turning light -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", BASES)
+def test_prepared_light_turns_as_the_map_does(assets, kind):
+    """Against the turned map averaged anew; for harmonics the turn is exact but for what cell averages blur."""
+    asset = assets[kind]
+    prepared = asset.prepare_light(sky())
+    for axis, degrees in [("y", 0), ("y", 50), ((1, 2, 3), 130), ("x", 180)]:
+        expected = asset.irradiance(sky().rotated(axis, degrees))
+        assert relative_l2(asset.irradiance(prepared.rotated(axis, degrees)), expected) < 0.01
+
+
+def test_turns_of_harmonics_compose_exactly(assets):
+    """A closed form: 360 small turns are no turn, which no resampling could do."""
+    asset = assets["sh"]
+    prepared = asset.prepare_light(sky())
+    turned = prepared
+    for _ in range(360):
+        turned = turned.rotated((1, 2, 3), 1)
+    np.testing.assert_allclose(asset.irradiance(turned), asset.irradiance(prepared), rtol=1e-4)
+    assert relative_l2(asset.irradiance(prepared.rotated("x", 90)), asset.irradiance(prepared)) > 0.1
+
+
+def test_prepared_light_keeps_local_lights(assets):
+    """They stay where they are, with every basis."""
+    lamp = mi_prt.PointLight((3, 4, 2), 50.0)
+    for kind in ("pca", "sh"):
+        asset = assets[kind]
+        expected = asset.irradiance(sky().rotated("y", 40)) + asset.irradiance(lamp)
+        result = asset.irradiance(asset.prepare_light([sky(), lamp]).rotated("y", 40))
+        assert relative_l2(result, expected) < 0.01
+
+
+# --- storage -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", BASES)
+def test_storage_is_as_the_formula_says(assets, tmp_path, kind):
+    """4d(v + 1) and 4ds bytes (section 7.1), of Haar 6 bytes a coefficient and no matrix, without a basis a bit a ray; and
+    the arrays in the file take just that."""
+    asset = assets[kind]
+    asset.save(tmp_path / "a.prt")
+    storage = describe_asset(asset)["storage"]
+    v, s, d = len(asset.points), 1536, 36
+    light = {"haar": s, "none": s}.get(kind, d)
+    coefficients = {"haar": 6 * d * v, "none": s // 16 * v}.get(kind, 4 * d * v)
+    assert storage["predicted"]["relighting"] == coefficients + 4 * light
+    assert storage["predicted"]["projection"] == {"haar": 0, "none": 4 * s}.get(kind, 4 * d * s)
+    with h5py.File(tmp_path / "a.prt") as file:
+        stored = file["coefficients"]
+        datasets = [stored] if isinstance(stored, h5py.Dataset) else [stored[name] for name in stored]
+        assert storage["measured"]["coefficients"] == sum(x.nbytes for x in datasets)
+    rays = 12 * s // 2 if kind == "none" else 0  # their vectors
+    assert storage["measured"]["coefficients"] == coefficients + rays
+    assert storage["measured"]["file"] == (tmp_path / "a.prt").stat().st_size
+    json.dumps(describe_asset(asset))
+
+
+@pytest.mark.parametrize("kind", ["pca", "haar"])
+def test_storage_is_predicted_from_the_scene(assets, kind):
+    """Before any work, the same figures."""
+    predicted = describe(scene(**PARTS), directions="cubemap:16", edge_length=0.3, basis=kind, coefficients=36)["predicted"]
+    storage = describe_asset(assets[kind])["storage"]["predicted"]
+    assert (predicted["relighting_bytes"], predicted["projection_bytes"]) == (storage["relighting"], storage["projection"])
+
+
+def test_info_of_automatic_coefficients():
+    settings = describe(scene(**PARTS), directions="cubemap:4", edge_length=0.8, coefficients="auto", variance=0.9)["settings"]
+    assert settings["coefficients"]["value"] == "auto" and settings["variance"]["value"] == 0.9

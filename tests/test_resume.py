@@ -1,0 +1,319 @@
+"""Interrupted runs: what was computed is kept, nothing half-written opens, and a continued run gives the same file."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+import mi_prt
+from conftest import cube, diffuse, disk, rectangle, scene
+from mi_prt import AssetError, SettingsError
+from mi_prt.basis import pca
+from mi_prt.workspace import RowFile, durable, temporary
+
+SCENE = scene(
+    floor=rectangle(size=2, bsdf=diffuse(0.6)), box=cube((0.2, 0.4, 0), 0.4), ball=disk((0, 1, 0.1), (0.3, 1.5, 0), 0.6)
+)
+SETTINGS = dict(directions="cubemap:16", edge_length=0.1, coefficients=24)
+LANES = 768 * 40  # blocks of 40 points: dozens of them
+
+
+@pytest.fixture(scope="module", autouse=True)
+def iterations():
+    """Even of so small a scene the basis is iterated, in passes that are kept."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pca, "NEGLIGIBLE", 0)
+        yield
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory):
+    """The file of a run that nothing disturbed."""
+    path = tmp_path_factory.mktemp("whole") / "asset.prt"
+    mi_prt.precompute(SCENE, output=path, **SETTINGS)
+    return path
+
+
+def partial(path):
+    return path.with_name(path.name + ".partial")
+
+
+# --- SIGKILL -------------------------------------------------------------------------------------------------------
+
+PROGRAM = """
+import sys, time
+sys.path.insert(0, sys.argv[1])
+import mi_prt
+from mi_prt.basis import pca
+from test_resume import LANES, SCENE, SETTINGS
+pca.NEGLIGIBLE = 0
+sys.modules["mi_prt.precompute"].LANES = LANES
+def progress(stage, done, total, detail):
+    print(stage, done, total, flush=True)
+    time.sleep(0.002)  # moments between the writes, in which a signal may arrive as well
+mi_prt.precompute(SCENE, output=sys.argv[2], resume=True, progress=progress, **SETTINGS)
+"""
+
+
+def start(path):
+    here = os.path.dirname(__file__)
+    return subprocess.Popen(
+        [sys.executable, "-c", PROGRAM, here, str(path)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+
+
+@pytest.mark.parametrize("chain", range(5))
+def test_killed_runs_end_in_the_same_file(undisturbed, tmp_path, chain):
+    """Four SIGKILLs in a row at random moments after the first block, 20 in all five cases; then the run is left alone.
+
+    While it is unfinished no file of that name opens; every continuation starts at or beyond where the last one was.
+    """
+    rng, path, reached = np.random.default_rng(chain), tmp_path / "asset.prt", -1
+    for _ in range(4):
+        process = start(path)
+        first = process.stdout.readline().split()
+        assert first, process.communicate()[1][-2000:]
+        assert int(first[1]) >= reached
+        time.sleep(rng.uniform(0, 0.5))
+        process.send_signal(signal.SIGKILL)
+        output, _ = process.communicate(timeout=60)
+        blocks = [int(line.split()[1]) for line in output.splitlines() if line.startswith("transport") and line.count(" ") == 2]
+        reached = max([int(first[1]), *blocks])
+        if path.exists():  # killed between the file and the end of the process: it has to be whole
+            assert path.read_bytes() == undisturbed.read_bytes()
+    last = start(path)
+    output, errors = last.communicate(timeout=120)
+    assert last.returncode == 0, errors[-2000:]
+    assert path.read_bytes() == undisturbed.read_bytes()
+    assert os.listdir(tmp_path) == ["asset.prt"]
+
+
+@pytest.mark.parametrize("stage", ["transport", "basis", "coefficients"])
+def test_interrupts_keep_what_was_computed(undisturbed, tmp_path, monkeypatch, stage):
+    """Ctrl-C in the middle of each stage: no file, the rows of before are there, and continuing gives the same file."""
+    monkeypatch.setattr(sys.modules["mi_prt.precompute"], "LANES", LANES)  # the function has the module's name
+    path, seen = tmp_path / "asset.prt", []
+
+    def interrupt(at, done, total, detail):
+        if at == stage and done > total // 2:
+            raise KeyboardInterrupt
+
+    def watch(at, done, total, detail):
+        seen.append((at, done))
+
+    with pytest.raises(KeyboardInterrupt):
+        mi_prt.precompute(SCENE, output=path, progress=interrupt, **SETTINGS)
+    assert not path.exists() and partial(path).is_dir()
+    mi_prt.precompute(SCENE, output=path, progress=watch, resume=True, **SETTINGS)
+    assert seen[0][0] == "transport" and seen[0][1] > 10
+    assert path.read_bytes() == undisturbed.read_bytes() and not partial(path).exists()
+
+
+# --- what may not be continued -------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def unfinished(tmp_path):
+    """A run that was interrupted after all rays were traced."""
+    path = tmp_path / "asset.prt"
+
+    def interrupt(stage, done, total, detail):
+        if stage == "basis":
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        mi_prt.precompute(SCENE, output=path, progress=interrupt, **SETTINGS)
+    return path
+
+
+OTHER_SCENES = {
+    "moved": SCENE | dict(box=cube((0.3, 0.4, 0), 0.4)),
+    "repainted": SCENE | dict(floor=rectangle(size=2, bsdf=diffuse(0.7))),
+    "without the ball": {key: part for key, part in SCENE.items() if key != "ball"},
+}
+
+
+@pytest.mark.parametrize("other", OTHER_SCENES)
+def test_another_scene_is_refused(unfinished, other):
+    with pytest.raises(SettingsError, match="scene was") as caught:
+        mi_prt.precompute(OTHER_SCENES[other], output=unfinished, resume=True, **SETTINGS)
+    assert "\n" not in str(caught.value) and "delete the folder" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [dict(directions="cubemap:8"), dict(coefficients=25), dict(seed=1), dict(rays_per_direction=2), dict(basis="haar"), dict(edge_length=0.2),
+     dict(coefficients="auto", variance=0.9)],
+    ids=str,
+)  # fmt: skip
+def test_other_settings_are_refused(unfinished, change):
+    """Each by its name, with both values; what was computed stays and can still be continued."""
+    with pytest.raises(SettingsError) as caught:
+        mi_prt.precompute(SCENE, output=unfinished, resume=True, **SETTINGS | change)
+    for key, value in change.items():
+        assert f"{key} was {SETTINGS.get(key, '')}" in str(caught.value) and f"now {value}" in str(caught.value)
+    assert (partial(unfinished) / "visibility.rows").stat().st_size > 0
+
+
+def test_another_version_is_refused(unfinished):
+    recorded = json.loads((partial(unfinished) / "run.json").read_text())
+    recorded["versions"]["mitsuba"] = "1.0"
+    (partial(unfinished) / "run.json").write_text(json.dumps(recorded))
+    with pytest.raises(SettingsError, match="versions was"):
+        mi_prt.precompute(SCENE, output=unfinished, resume=True, **SETTINGS)
+
+
+def test_an_unfinished_run_is_not_overwritten(unfinished):
+    """Without `resume` it could only be lost."""
+    with pytest.raises(SettingsError, match="--resume"):
+        mi_prt.precompute(SCENE, output=unfinished, **SETTINGS)
+
+
+def test_resume_without_anything_to_continue_starts(undisturbed, tmp_path):
+    """So that a script can always pass it."""
+    mi_prt.precompute(SCENE, output=tmp_path / "a.prt", resume=True, **SETTINGS)
+    assert (tmp_path / "a.prt").read_bytes() == undisturbed.read_bytes()
+
+
+def test_too_many_coefficients_cost_no_rays(tmp_path):
+    """The rank is known only after the fit: then another number may be asked for, and the rays are not traced again."""
+    flat = scene(box=cube())  # six normals and no shadow
+    settings = dict(directions="cubemap:8", edge_length=0.4)
+    path, seen = tmp_path / "a.prt", []
+    with pytest.raises(SettingsError, match="at most") as caught:
+        mi_prt.precompute(flat, output=path, coefficients=60, **settings)
+    rank = int(str(caught.value).split("at most ")[1].split()[0])
+    asset = mi_prt.precompute(
+        flat, output=path, coefficients=rank, resume=True, progress=lambda *event: seen.append(event), **settings
+    )
+    assert len(asset.basis) == rank == 5 and seen[0][:3] == ("transport", seen[0][2], seen[0][2])
+
+
+def test_a_workspace_belongs_to_one_process(tmp_path):
+    with durable(tmp_path / "a.prt", {}, False):
+        with pytest.raises(SettingsError, match="another process"):
+            with durable(tmp_path / "a.prt", {}, True):
+                pass
+    assert os.listdir(tmp_path) == []
+
+
+def test_what_stands_in_the_way(tmp_path):
+    """A file where the folder should be; a folder that was left before anything was recorded is no run."""
+    (tmp_path / "a.prt.partial").write_text("")
+    with pytest.raises(SettingsError, match="a.prt.partial"):
+        with durable(tmp_path / "a.prt", {}, False):
+            pass
+    (tmp_path / "b.prt.partial").mkdir()
+    (tmp_path / "b.prt.partial" / "visibility.rows").write_bytes(b"old")
+    with durable(tmp_path / "b.prt", {}, False) as workspace:
+        assert workspace.rows("visibility", 2, 3).filled == 0
+
+
+def test_an_unfinished_run_is_no_asset(unfinished):
+    for path in [unfinished, partial(unfinished), partial(unfinished) / "visibility.rows"]:
+        with pytest.raises(AssetError):
+            mi_prt.load(path)
+
+
+# --- rows on disk --------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def rows(tmp_path):
+    """Rows 0…9 of 5 bytes in blocks of 4, 4 and 2, and their file."""
+    matrix = np.random.default_rng(0).integers(0, 256, (10, 5)).astype(np.uint8)
+    file = RowFile(tmp_path / "a.rows", 10, 5)
+    for block in np.split(matrix, [4, 8]):
+        file.append(block)
+    file.close()
+    return tmp_path / "a.rows", matrix
+
+
+def test_rows_are_read_by_slice_and_by_index(rows):
+    path, matrix = rows
+    file = RowFile(path, 10, 5)
+    assert file.filled == 10 and file.shape == matrix.shape
+    for index in [slice(None), slice(3, 7), slice(8, 20), np.array([0, 3, 9]), np.array([5]), np.array([], int)]:
+        np.testing.assert_array_equal(file[index], matrix[index])
+
+
+@pytest.mark.parametrize("cut", range(0, 51, 7))
+def test_a_torn_end_is_dropped(rows, cut):
+    """The data end anywhere, as after a power failure: whole blocks stay, and appending goes on behind them."""
+    path, matrix = rows
+    path.write_bytes(path.read_bytes()[:cut])
+    file = RowFile(path, 10, 5)
+    kept = 0 if cut < 20 else 4 if cut < 40 else 8 if cut < 50 else 10
+    assert file.filled == kept
+    if kept < 10:
+        file.append(matrix[kept:])
+    np.testing.assert_array_equal(file[:], matrix)
+    file.close()
+    np.testing.assert_array_equal(RowFile(path, 10, 5)[:], matrix)
+
+
+def test_a_damaged_block_and_a_torn_journal_are_dropped(rows):
+    path, matrix = rows
+    content = bytearray(path.read_bytes())
+    content[25] ^= 1  # in the second block
+    path.write_bytes(content)
+    assert RowFile(path, 10, 5).filled == 4
+    journal = path.with_suffix(".journal")
+    for text in [b"4", b"4 x\n", b"-4 1\n", b"999 1\n", b"\xff\xfe\n", b""]:
+        journal.write_bytes(text)
+        assert RowFile(path, 10, 5).filled == 0
+
+
+def test_arrays_are_kept_whole_or_not_at_all():
+    with temporary() as workspace:
+        assert workspace.keep("a", lambda: np.arange(3.0)).sum() == 3
+        assert workspace.keep("a", lambda: np.zeros(3)).sum() == 3
+        (workspace.folder / "a.npy").write_bytes(b"torn")
+        assert workspace.keep("a", lambda: np.ones(3)).sum() == 3
+        assert sorted(p.name for p in workspace.folder.iterdir()) == ["a.npy"]
+        folder = workspace.folder
+    assert not folder.exists()
+
+
+# --- memory --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("bad", ["0", "-1G", "many", "3 apples", "nan", 0, True, "inf", ""])
+def test_bad_memory(bad):
+    with pytest.raises(SettingsError, match="memory"):
+        mi_prt.precompute(SCENE, max_memory=bad, **SETTINGS)
+
+
+def test_too_little_memory_says_how_much_is_needed():
+    with pytest.raises(SettingsError, match="raise max_memory"):
+        mi_prt.precompute(SCENE, max_memory="10M", **SETTINGS)
+
+
+def test_a_run_stays_within_its_memory_and_gives_the_same_file(undisturbed, tmp_path):
+    """The peak of a fresh process, by the kernel's own count, with a limit that is a quarter of what it takes by default."""
+    code = """
+import sys; sys.path.insert(0, sys.argv[1])
+import mi_prt
+from mi_prt.basis import pca
+from mi_prt.memory import resident_bytes
+from mi_prt.runtime import mitsuba, peak_memory_bytes
+from mi_prt.scene.scene import open_scene
+from test_resume import SCENE, SETTINGS
+pca.NEGLIGIBLE = 0
+mi_prt.precompute(SCENE, directions="cubemap:2", edge_length=1)  # what Mitsuba and Embree take once
+limit = resident_bytes() + 60_000_000
+mi_prt.precompute(SCENE, output=sys.argv[2], max_memory=limit, **SETTINGS)
+print(limit, peak_memory_bytes())
+"""
+    ran = subprocess.run(
+        [sys.executable, "-c", code, os.path.dirname(__file__), str(tmp_path / "a.prt")], capture_output=True, text=True, timeout=120
+    )
+    assert ran.returncode == 0, ran.stderr[-2000:]
+    limit, peak = map(int, ran.stdout.split())
+    assert peak <= limit
+    assert (tmp_path / "a.prt").read_bytes() == undisturbed.read_bytes()
