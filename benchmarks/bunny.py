@@ -15,6 +15,8 @@ import numpy as np
 
 import mi_prt
 from mi_prt.basis.pca import fit_pca
+from mi_prt.basis.rows import Rows
+from mi_prt.basis.target import Target
 from mi_prt.directions import parse_directions
 from mi_prt.evaluate import metrics
 from mi_prt.evaluate.ground_truth import point_irradiance
@@ -44,8 +46,8 @@ def main():
     points = sample_points(scene)
     directions = parse_directions(arguments.directions)
     transport = sample_direct(scene, points, directions, arguments.rays_per_direction)
-    lit = np.flatnonzero(transport.bits.any(axis=1))
-    bases = {d: fit_pca(transport.rows, lit, directions.solid_angles, d) for d in COEFFICIENTS}
+    lit = Rows(transport.rows, np.flatnonzero(~transport.dark()), directions)
+    bases = {d: fit_pca(lit, Target(d)).basis for d in COEFFICIENTS}
     chosen = np.sort(np.random.default_rng(0).permutation(len(points))[: arguments.points])
     rows = transport.rows(chosen)
 

@@ -2,12 +2,13 @@
 
 Usage: python benchmarks/eigentransport.py [--assets DIR] [--output docs/eigentransport.md] [--only variance,error,…]
 
-DIR holds meshes/*.ply and hdr/*.exr (see benchmarks/README.md). With --only, sections are printed and not written to the page.
+DIR holds meshes/*.ply and hdr/*.exr (see benchmarks/README.md). With --only the other sections of the page stay as they are.
 Nothing else should run on the machine meanwhile: some sections tell times.
 """
 
 import argparse
 import json
+import re
 import subprocess
 import sys
 import tempfile
@@ -64,14 +65,21 @@ def main():
     chosen = [name for name in arguments.only.split(",") if name] or list(SECTIONS)
     pictures = arguments.output.with_suffix("")
     pictures.mkdir(parents=True, exist_ok=True)
-    page = [HEAD]
+    sections = _existing(arguments.output)
     for name in chosen:
         started = time.perf_counter()
-        section = "\n".join(SECTIONS[name](arguments.assets, pictures))
-        print(f"{section}\n\n({name}: {time.perf_counter() - started:.0f} s)\n", flush=True)
-        page.append(section)
-    if not arguments.only:
+        sections[name] = "\n".join(SECTIONS[name](arguments.assets, pictures)).strip()
+        print(f"{sections[name]}\n\n({name}: {time.perf_counter() - started:.0f} s)\n", flush=True)
+        page = [HEAD] + [f"<!-- {name} -->\n{sections[name]}" for name in SECTIONS if name in sections]
         arguments.output.write_text("\n\n".join(page) + "\n")
+
+
+def _existing(path):
+    """The sections of a page by their names."""
+    if not path.exists():
+        return {}
+    parts = re.split(r"<!-- (\w+) -->\n", path.read_text())
+    return dict(zip(parts[1::2], (part.strip() for part in parts[2::2])))
 
 
 HEAD = """# The Eigentransport paper, measured
@@ -129,17 +137,17 @@ def captured_variance(assets, pictures):
     yield "| scene | points | 90 % | 95 % | 99 % | captured by 48 | relative error with 48 |"
     yield "|---|---:|---:|---:|---:|---:|---:|"
     figure, axes = plt.subplots(figsize=(6, 3.8))
-    needed = {}
+    needed, errors = {}, {}
     for i, mesh in enumerate(MESHES):
         for plane in (False, True):
             sampled = Sampled(assets, mesh, plane)
             fit = sampled.fit("pca", MOST)
             total = np.cumsum(fit.basis.captured_variance)
             counts = [1 + int(np.searchsorted(total, share)) if total[-1] >= share else None for share in (0.9, 0.95, 0.99)]
-            needed[mesh, plane] = counts
+            needed[mesh, plane], errors[mesh, plane] = counts, residuals(fit, 48)
             name = f"{mesh} on a plane" if plane else mesh
             texts = [str(count) if count else f"> {MOST}" for count in counts]
-            yield f"| {name} | {len(sampled.points):,} | {' | '.join(texts)} | {total[47]:.2%} | {residuals(fit, 48):.3f} |"
+            yield f"| {name} | {len(sampled.points):,} | {' | '.join(texts)} | {total[47]:.2%} | {errors[mesh, plane]:.3f} |"
             axes.plot(np.arange(1, len(total) + 1), total, f"C{i}{'--' if plane else '-'}", label=name)
     axes.set(xscale="log", xlabel="components", ylabel="captured variance", ylim=(0.3, 1))
     axes.grid(alpha=0.3), axes.legend(fontsize=8)
@@ -148,8 +156,9 @@ def captured_variance(assets, pictures):
     better = [mesh for mesh in MESHES if _more(needed[mesh, False][1], needed[mesh, True][1])]
     yield (
         "The paper says that added planes make the basis less effective. By components for 95 % of the variance a plane makes it "
-        f"worse for {_listed(worse)} and better for {_listed(better)}. The share is of another whole, though: a plane's many bright and "
-        "alike rows raise the variance that the first components take."
+        f"worse for {_listed(worse)} and better for {_listed(better)}. The share is of another whole, though: rows of a plane are brighter, so "
+        "that the same share lost is less of the light. By relative error, the last column, 48 components are worse with a plane for "
+        f"{_listed([mesh for mesh in MESHES if errors[mesh, True] > errors[mesh, False]])}."
     )
 
 
@@ -299,7 +308,8 @@ def rotation(assets, pictures):
         environment = mi_prt.EnvironmentMap(path)
         turned = environment.rotated(axis, degrees)
         expected = _timed(times, "brute force", lambda: cell_radiance(turned, DIRECTIONS))
-        results = {"paper": _timed(times, "paper", lambda: bilinear(cell_radiance_of(environment), turned.rotation @ environment.rotation.T))}
+        canonical = cell_radiance(environment, DIRECTIONS)  # the paper keeps light sampled before it is turned
+        results = {"paper": _timed(times, "paper", lambda: bilinear(canonical, turned.rotation))}
         for refinement in (1, 2, 4):
             prepared = on_lattice(environment, DIRECTIONS, refinement)
             results[refinement] = _timed(times, refinement, lambda: cell_radiance(prepared.rotated(axis, degrees), DIRECTIONS))
@@ -315,16 +325,6 @@ def rotation(assets, pictures):
         f"×2 {medians[2]:.1f}, ×4 {medians[4]:.1f} (the default). The bilinear way neither keeps energy nor constants at cube edges; "
         "after projection all differences shrink, as the paper says."
     )
-
-
-_CANONICAL = {}
-
-
-def cell_radiance_of(environment):
-    """Cells of a map that is not turned, computed once: the paper keeps the light sampled in its canonical orientation."""
-    if environment.source not in _CANONICAL:
-        _CANONICAL[environment.source] = cell_radiance(environment, DIRECTIONS)
-    return _CANONICAL[environment.source]
 
 
 def bilinear(radiance, rotation):
@@ -358,8 +358,8 @@ def _face_coordinates(vectors, face):
 def memory_table(assets, pictures):
     """Section 7.1."""
     yield "## Memory (section 7.1)\n"
-    yield "48 coefficients: 4d(v + 1) bytes to relight, 4ds more to project light; measured are the arrays in the asset's file.\n"
-    yield "| mesh | points v | 4d(v + 1), MB | coefficients in the file, MB | 4ds, MB | basis in the file, MB | file, MB | file without projection and positions would be |"
+    yield "48 coefficients: 4d(v + 1) bytes to relight, 4ds more to project light; measured are the arrays in the asset's file. v counts the mesh's vertices and those that tessellation adds; the rest of a file is positions, normals, albedo and the like.\n"
+    yield "| mesh | points v | 4d(v + 1), MB | coefficients in the file, MB | 4ds, MB | basis in the file, MB | whole file, MB | 4d(v + 1) of it |"
     yield "|---|---:|---:|---:|---:|---:|---:|---:|"
     with tempfile.TemporaryDirectory() as folder:
         for mesh in PAPER_MESHES:

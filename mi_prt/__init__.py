@@ -30,7 +30,7 @@ from .precompute import precompute  # noqa: E402
 from .relight import relight_to_file  # noqa: E402
 from .render.integrator import register_integrator  # noqa: E402
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 __all__ = [
     "Asset",
     "AssetError",

@@ -114,12 +114,10 @@ class Asset:
         """
         light = light if isinstance(light, HarmonicLight) else as_light(light)
         irradiance = self.irradiance_from(*self.project_light(light))
-        warning = hull_warning(light.points, self.points.positions)
+        warning = hull_warning(light.points, self.points.hull)
         if warning:
             warnings.warn(warning, LightWarning, stacklevel=2)
-        for source in light.points:
-            irradiance += self._local_irradiance(source, nearest)
-        return irradiance
+        return irradiance + self.local_irradiance(light.points, nearest) if light.points else irradiance
 
     def irradiance_from(self, coefficients, mean_response):
         """Irradiance (n, 3) from light that is projected already: c·ℓ + m (Eigentransport eq. 10, mean kept exactly).
@@ -131,9 +129,20 @@ class Asset:
         irradiance += mean_response
         return np.maximum(irradiance, 0, out=irradiance)
 
-    def _local_irradiance(self, source, nearest):
-        """Irradiance (n, 3) by one local light: its directions' transport times I/r² (Eigentransport eq. 4, erratum 3)."""
-        cells, irradiance = arrival(source, self.points.positions, self.directions, nearest)
+    def local_irradiance(self, lights, nearest=1):
+        """Irradiance (n, 3) float32 in W/m² by local lights alone, wherever they are; see `irradiance`.
+
+        Each is the transport of the directions it is seen in times I/r² (Eigentransport eq. 4, erratum 3).
+
+        Parameters
+        ----------
+        lights : sequence of PointLight
+        nearest : int
+        """
+        return sum(self._arriving(light, nearest) for light in lights)
+
+    def _arriving(self, light, nearest):
+        cells, irradiance = arrival(light, self.points.positions, self.directions, nearest)
 
         def transport(first):
             block = slice(first, first + BLOCK_ROWS)

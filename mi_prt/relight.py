@@ -5,7 +5,7 @@ import warnings
 from pathlib import Path
 
 from .errors import SceneError, SettingsError
-from .evaluate.local_lights import local_irradiance, measure_error
+from .evaluate.local_lights import measure_error
 from .files import check_writable
 from .lighting.environment import LightWarning
 from .lighting.local import hull_warning
@@ -90,7 +90,7 @@ def relight_to_file(
     clock.append(time.perf_counter())
     irradiance = asset.irradiance_from(*projected)
     if chosen.points:
-        local = local_irradiance(asset, chosen.points, nearest)
+        local = asset.local_irradiance(chosen.points, nearest)
         irradiance += local
     radiance = asset.outgoing_radiance(irradiance)
     clock.append(time.perf_counter())
@@ -119,7 +119,7 @@ def relight_to_file(
 def _local_light_error(asset, lights, local, opened, scene):
     """The entry local_light_error, or none where the scene is neither open nor needed, or not to be had."""
     if opened is None:
-        warning = hull_warning(lights, asset.points.positions)
+        warning = hull_warning(lights, asset.points.hull)
         if not warning:
             return {}
         try:

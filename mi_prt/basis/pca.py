@@ -16,7 +16,7 @@ Two ways lead to them, and the cheaper one for the shape at hand is taken:
 import numpy as np
 import scipy.linalg
 
-from ..parallel import BLOCK_ROWS
+from ..parallel import BLOCK_ROWS, one_blas_thread
 from .linear import LinearBasis
 from .rows import Rows
 from .target import Fit, Target, fit_of
@@ -128,10 +128,12 @@ def _subspace_iteration(rows, mean, components, subspace, seed, progress, keep):
     def gram(chunk):
         return (sum((narrow.T @ narrow).astype(np.float64) for _, narrow in _narrow(rows, chunk, mean, span)),)
 
-    values, rotation = scipy.linalg.eigh(*rows.sums(gram))
+    (ritz,) = rows.sums(gram)
     progress(len(passes) + 1, len(passes) + 1)
     leading = slice(None, -components - 1, -1)
-    return np.maximum(values[leading], 0), span @ rotation[:, leading]
+    with one_blas_thread():
+        values, rotation = scipy.linalg.eigh(ritz)
+        return np.maximum(values[leading], 0), span @ rotation[:, leading]
 
 
 def _iterated(rows, index, mean, basis):
@@ -150,7 +152,8 @@ def _iterated(rows, index, mean, basis):
 
 
 def _orthonormal(vectors):
-    return np.linalg.qr(vectors)[0].astype(np.float32)
+    with one_blas_thread():
+        return np.linalg.qr(vectors)[0].astype(np.float32)
 
 
 def _narrow(rows, index, mean, basis):

@@ -11,7 +11,7 @@ from ..provenance import open_scene_of
 from ..render.display import display, exposure
 from ..render.image import coverage, pick_sensor, render_image, resized
 from . import ground_truth, metrics
-from .local_lights import local_irradiance, measure_error
+from .local_lights import measure_error
 from .report import write_report
 
 REFERENCES = ("modelled", "full")
@@ -85,7 +85,7 @@ def compare(
     started = time.perf_counter()
     irradiance = asset.irradiance(chosen_light.distant)
     if chosen_light.points:
-        local = local_irradiance(asset, chosen_light.points, nearest)
+        local = asset.local_irradiance(chosen_light.points, nearest)
         irradiance += local
     seconds["relight"] = time.perf_counter() - started
 

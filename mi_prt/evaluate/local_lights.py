@@ -1,30 +1,14 @@
-"""Local lights from an asset, and how far they are from Mitsuba's."""
+"""How far an asset's local lights are from Mitsuba's."""
 
 import warnings
 
 import numpy as np
 
 from ..lighting.environment import LightWarning
-from ..lighting.light import Light
 from ..lighting.local import hull_warning
 from . import ground_truth, metrics
 
 MEASURED_POINTS = 4096
-
-
-def local_irradiance(asset, lights, nearest=1):
-    """Irradiance (n, 3) float32 in W/m² under local lights alone, without the warning: `measure_error` gives a better one.
-
-    Parameters
-    ----------
-    asset : Asset
-    lights : tuple of PointLight
-    nearest : int
-        Directions that stand for a light, see `Asset.irradiance`.
-    """
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", LightWarning)
-        return asset.irradiance(Light(points=lights), nearest)
 
 
 def measure_error(asset, lights, irradiance, scene, seed=0):
@@ -35,7 +19,7 @@ def measure_error(asset, lights, irradiance, scene, seed=0):
     asset : Asset
     lights : tuple of PointLight
     irradiance : (n, 3)
-        As `local_irradiance` gives it.
+        As `Asset.local_irradiance` gives it.
     scene : Scene
         That of the asset.
     seed : int
@@ -58,7 +42,7 @@ def measure_error(asset, lights, irradiance, scene, seed=0):
         "bias": metrics.relative_bias(irradiance[chosen], truth),
         "points": len(chosen),
     }
-    warning = hull_warning(lights, asset.points.positions)
+    warning = hull_warning(lights, asset.points.hull)
     if warning:
         measured = f"relative RMSE {error['relative_rmse']:.1%} and bias {error['bias']:+.1%} at {len(chosen):,} points"
         warnings.warn(f"{warning}: {measured}", LightWarning, stacklevel=3)

@@ -64,8 +64,8 @@ class PointLight:
 
     def __post_init__(self):
         position = _numbers(self.position)
-        if position.shape != (3,) or not np.isfinite(position).all():
-            raise LightError(f"a light's position must be three finite numbers, got {self.position}")
+        if position.shape != (3,) or not _is_finite(position):
+            raise LightError(f"a light's position must be three finite float32 numbers, got {self.position}")
         object.__setattr__(self, "position", position)
         object.__setattr__(self, "intensity", _rgb("intensity", self.intensity))
 
@@ -134,9 +134,15 @@ def as_light(light):
 def _rgb(what, value):
     """One number or three as (3,) float64, finite and not negative."""
     rgb = _numbers(value)
-    if rgb.shape not in ((), (3,)) or not np.isfinite(rgb).all() or (rgb < 0).any():
-        raise LightError(f"a light's {what} must be one or three finite numbers ≥ 0, got {value}")
+    if rgb.shape not in ((), (3,)) or not _is_finite(rgb) or (rgb < 0).any():
+        raise LightError(f"a light's {what} must be one or three finite float32 numbers ≥ 0, got {value}")
     return np.broadcast_to(rgb, 3).copy()
+
+
+def _is_finite(values):
+    """Whether float32, which Mitsuba computes in, holds all of them."""
+    with np.errstate(over="ignore"):
+        return np.isfinite(values.astype(np.float32)).all()
 
 
 def _numbers(value):

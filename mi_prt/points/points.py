@@ -1,11 +1,13 @@
 """The points at which transport is known, for a whole scene."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from ..errors import SceneError, SettingsError
 from ..runtime import mitsuba
+from .hull import ConvexHull
 from .lattice import Patches, node_count
 from .tessellate import TESSELLATED_SHAPES, patch_levels, tessellate
 
@@ -58,6 +60,11 @@ class Points:
     def at(self, index):
         """Only the points of an index array; `patches` stay those of all points."""
         return replace(self, **{name: getattr(self, name)[index] for name in POINT_FIELDS})
+
+    @cached_property
+    def hull(self):
+        """The ConvexHull of the points, computed once: 10 to 30 ms for 40,000, 0.3 s if they are all on the hull."""
+        return ConvexHull(self.positions)
 
     def ray_origins(self, offset):
         """Where rays start (n, 3): `offset` metres off the surface, and as far in from its rim."""
