@@ -8,10 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from . import asset_file
-from .basis.harmonics import HarmonicBasis, HarmonicLight
-from .lighting.cells import cell_radiance
 from .lighting.environment import LightWarning
-from .lighting.lattice import on_lattice
 from .lighting.light import as_light
 from .lighting.local import arrival, hull_warning
 from .parallel import BLOCK_ROWS, map_chunks, one_blas_thread
@@ -60,7 +57,7 @@ class Asset:
 
         Parameters
         ----------
-        light : Light, what `as_light` accepts, or what `prepare_light` returned
+        light : Light or what `as_light` accepts
             Local lights in it are left aside: at each point they are another light.
 
         Returns
@@ -68,15 +65,12 @@ class Asset:
         coefficients : (d, 3) float32
         mean_response : (3,) float32
         """
-        if isinstance(light, HarmonicLight):
-            return light.turned, np.zeros(3, np.float32)
-        with one_blas_thread():
-            return self.basis.project_light(cell_radiance(as_light(light).distant, self.directions))
+        return self.basis.project(as_light(light).distant, self.directions)
 
     def prepare_light(self, light):
         """The same light in a form that turns in milliseconds.
 
-        Spherical harmonics turn in closed form; for other bases the light is kept on a fine lattice.
+        Maps are kept on a fine lattice; spherical harmonics turn them in closed form.
 
         >>> sky = asset.prepare_light("sky.exr")
         >>> for degrees in range(360):
@@ -88,12 +82,9 @@ class Asset:
 
         Returns
         -------
-        Light or HarmonicLight
+        Light
         """
-        light = as_light(light)
-        if isinstance(self.basis, HarmonicBasis):
-            return HarmonicLight(self.project_light(light)[0], points=light.points)
-        return on_lattice(light, self.directions)
+        return self.basis.prepare(as_light(light), self.directions)
 
     # --- relighting ----------------------------------------------------------------------------------------------
 
@@ -102,7 +93,7 @@ class Asset:
 
         Parameters
         ----------
-        light : Light, what `as_light` accepts, or what `prepare_light` returned
+        light : Light or what `as_light` accepts
             Any number of environment maps, directional and local lights; their irradiances add up.
         nearest : int
             Directions that stand for a local light (Eigentransport, section 4.2.1).
@@ -112,44 +103,40 @@ class Asset:
         LightWarning
             If a local light is inside the convex hull of the scene: transport holds visibility to infinity.
         """
-        light = light if isinstance(light, HarmonicLight) else as_light(light)
-        irradiance = self.irradiance_from(*self.project_light(light))
-        warning = hull_warning(light.points, self.points.hull)
+        light = as_light(light)
+        warning = hull_warning(light.point_lights, self.points.hull) if light.point_lights else None
         if warning:
             warnings.warn(warning, LightWarning, stacklevel=2)
-        return irradiance + self.local_irradiance(light.points, nearest) if light.points else irradiance
+        return self.irradiance_from(*self.project_light(light), light.point_lights, nearest)
 
-    def irradiance_from(self, coefficients, mean_response):
-        """Irradiance (n, 3) from light that is projected already: c·ℓ + m (Eigentransport eq. 10, mean kept exactly).
+    def irradiance_from(self, coefficients, mean_response, point_lights=(), nearest=1):
+        """Irradiance (n, 3) from distant light that is projected already, c·ℓ + m (Eigentransport eq. 10, mean kept exactly),
+        and local lights.
 
-        What compression leaves below zero is zero.
+        What compression leaves of the sum below zero is zero.
         """
         with one_blas_thread():
             irradiance = self.coefficients @ coefficients
         irradiance += mean_response
+        for light in point_lights:
+            irradiance += self._arriving(light, nearest)
         return np.maximum(irradiance, 0, out=irradiance)
 
-    def local_irradiance(self, lights, nearest=1):
-        """Irradiance (n, 3) float32 in W/m² by local lights alone, wherever they are; see `irradiance`.
-
-        Each is the transport of the directions it is seen in times I/r² (Eigentransport eq. 4, erratum 3).
-
-        Parameters
-        ----------
-        lights : sequence of PointLight
-        nearest : int
-        """
-        return sum(self._arriving(light, nearest) for light in lights)
+    def local_irradiance(self, point_lights, nearest=1):
+        """Irradiance (n, 3) float32 in W/m² by local lights alone, wherever they are; see `irradiance`."""
+        none = np.zeros((len(self.points), 3), np.float32)
+        return np.maximum(sum((self._arriving(light, nearest) for light in point_lights), none), 0)
 
     def _arriving(self, light, nearest):
+        """Response (n, 3) to a local light: the transport of the directions it is seen in times I/r² (eq. 4, erratum 3)."""
         cells, irradiance = arrival(light, self.points.positions, self.directions, nearest)
 
         def transport(first):
             block = slice(first, first + BLOCK_ROWS)
             return self.basis.at(self.coefficients[block], cells[block]).mean(axis=1)
 
-        transport = np.concatenate(list(map_chunks(transport, range(0, len(self.points), BLOCK_ROWS))))
-        return irradiance * np.maximum(transport, 0)[:, None]
+        seen = np.concatenate(list(map_chunks(transport, range(0, len(self.points), BLOCK_ROWS))))
+        return irradiance * seen[:, None]
 
     def relight(self, light, nearest=1):
         """Outgoing radiance B = ρ/π · E at the points, (n, 3) float32 in W/(m²·sr). See `irradiance`."""

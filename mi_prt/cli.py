@@ -39,7 +39,7 @@ Lights = Annotated[
         "--light",
         metavar="SPEC",
         help="point:x,y,z:r,g,b (W/sr), directional:dx,dy,dz:r,g,b (direction of travel, W/m²), envmap:FILE or "
-        "envmap:FILE:y:30; one number is grey. May be repeated: lights add up, also to --envmap.",
+        "envmap:FILE:y:30, or scene (its own distant light); one number is grey. May be repeated: lights add up, also to --envmap.",
     ),
 ]
 Nearest = Annotated[int, typer.Option("--nearest", metavar="K", help="Directions that stand for a local light.")]
@@ -120,7 +120,7 @@ def info(
 
 
 @app.command(
-    epilog="Examples: mi-prt precompute scenes/teapot.xml -o teapot.prt --coefficients 96 -D spp=16; "
+    epilog="Examples: mi-prt precompute scenes/teapot.xml -o teapot.prt --coefficients 96 -D spp=16\n\n"
     "mi-prt precompute scenes/teapot.xml -o teapot.prt --coefficients auto --variance 0.98 --max-memory 2G --resume"
 )
 def precompute(
@@ -185,7 +185,7 @@ def precompute(
 
 @app.command(
     epilog="Examples: mi-prt relight teapot.prt -o teapot.png --envmap sky.exr --rotate y:90 --size 640x480\n\n"
-    "mi-prt relight teapot.prt -o lamps.png --light point:3,4,2:60,50,40 --light point:-3,4,2:20 --light envmap:sky.exr:y:90"
+    "mi-prt relight teapot.prt -o lamps.png --light scene --light point:3,4,2:60,50,40 --light envmap:sky.exr:y:90"
 )
 def relight(
     asset_path: Annotated[Path, typer.Argument(metavar="FILE", help="An asset.")],

@@ -177,17 +177,23 @@ def _reasons(settings, points, directions, coefficients):
         "basis": "components of this scene's own transport: the least error for their number"
         if settings.basis == "pca"
         else "as asked",
-        "coefficients": f"as few as capture {settings.variance:g} of the variance; the prediction takes {AUTO_COEFFICIENTS}"
-        if settings.variance is not None
-        else "48 relight in about a millisecond; more of them sharpen shadows"
-        if settings.coefficients is None
-        else "as asked",
+        "coefficients": _coefficients_reason(settings),
         "edge_length": auto if settings.edge_length == "auto" else "as asked",
         "rays_per_direction": "1 samples the middle of each cell; 4 antialias the edges of shadows",
-        "seed": "start of the randomized fit",
+        "seed": "start of the randomized fit" if settings.basis == "pca" else "nothing is random with this basis",
     }
     chosen |= {"coefficients": coefficients, "edge_length": round(edge, 6)}
     if settings.variance is not None:
         chosen["coefficients"] = "auto"
         reasons["variance"] = "share of the transport's variance to capture"
     return {name: {"value": chosen[name], "reason": reason} for name, reason in reasons.items()}
+
+
+def _coefficients_reason(settings):
+    if settings.basis == "none":
+        return "no basis: all directions are kept, as bits of visibility"
+    if settings.variance is not None:
+        return f"as few as capture {settings.variance:g} of the variance; the prediction takes {AUTO_COEFFICIENTS}"
+    if settings.coefficients is None:
+        return "so many relight in about a millisecond; more of them sharpen shadows"
+    return "as asked"

@@ -12,7 +12,7 @@ from .asset import Asset
 from .basis.bases import check_basis, check_components, default_components, fit_basis, most_components
 from .basis.none import NoBasis
 from .basis.rows import Rows
-from .basis.target import Fit, Target
+from .basis.target import Fit, Target, check_room
 from .directions import parse_directions
 from .errors import SettingsError
 from .memory import free_bytes, parse_bytes, resident_bytes
@@ -302,12 +302,20 @@ def _compress(transport, directions, buried, settings, target, room, workspace, 
         raise SettingsError(
             f"{settings.coefficients} coefficients are above the rank of the transport: at most {len(fit.basis)}"
         )
-    blocks = []
+    size = coefficient_bytes(settings.basis, *transport.shape, len(fit.basis))
+    check_room(f"{len(fit.basis):,} coefficients of {n:,} points", 2 * size, room.basis)
+    return fit, _encode(fit.basis, transport, progress)
+
+
+def _encode(basis, transport, progress):
+    """Coefficients of all points, block by block."""
+    n, _ = transport.shape
     starts = range(0, n, BLOCK_ROWS)
-    for block in map_chunks(lambda first: fit.basis.encode(transport.rows(slice(first, first + BLOCK_ROWS))), starts):
+    blocks = []
+    for block in map_chunks(lambda first: basis.encode(transport.rows(slice(first, first + BLOCK_ROWS))), starts):
         blocks.append(block)
         progress("coefficients", min(len(blocks) * BLOCK_ROWS, n), n, "")
-    return fit, scipy.sparse.vstack(blocks, format="csr") if scipy.sparse.issparse(blocks[0]) else np.concatenate(blocks)
+    return scipy.sparse.vstack(blocks, format="csr") if scipy.sparse.issparse(blocks[0]) else np.concatenate(blocks)
 
 
 class _Clock:

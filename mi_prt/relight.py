@@ -9,7 +9,7 @@ from .evaluate.local_lights import measure_error
 from .files import check_writable
 from .lighting.environment import LightWarning
 from .lighting.local import hull_warning
-from .lighting.scene_light import lit_scene, turned_light
+from .lighting.scene_light import is_of_scene, lit_scene, turned_light
 from .provenance import open_scene_of
 from .render.display import exposure
 from .render.export import write_image, write_npz, write_ply
@@ -40,8 +40,8 @@ def relight_to_file(
     asset : Asset
     output : path
         .exr (linear) or .png (exposed, sRGB) image; .ply or .npz of the points.
-    light : what `as_light` accepts, optional
-        By default the scene's own distant light.
+    light : what `as_light` accepts, or a list of such and 'scene', optional
+        By default 'scene', the scene's own distant light.
     rotate : (axis, degrees), optional
         Turns the distant light.
     scene : path, dict or mi.Scene, optional
@@ -79,19 +79,16 @@ def relight_to_file(
         raise SettingsError(f"renderer '{renderer}' is not known: use {' or '.join(RENDERERS)}")
     check_writable(output)
 
-    needs_scene = suffix in IMAGES or light is None
+    needs_scene = suffix in IMAGES or is_of_scene(light)
     opened = open_scene_of(asset, scene) if needs_scene else None
     shown, chosen = turned_light(opened, light, rotate)
     if renderer == "raster":
         from .render.raster import RasterScene  # opens OpenGL: only where it is asked for
 
     clock = [time.perf_counter()]
-    projected = asset.project_light(chosen.distant)
+    projected = asset.project_light(chosen)
     clock.append(time.perf_counter())
-    irradiance = asset.irradiance_from(*projected)
-    if chosen.points:
-        local = asset.local_irradiance(chosen.points, nearest)
-        irradiance += local
+    irradiance = asset.irradiance_from(*projected, chosen.point_lights, nearest)
     radiance = asset.outgoing_radiance(irradiance)
     clock.append(time.perf_counter())
     if suffix == ".ply":
@@ -111,12 +108,12 @@ def relight_to_file(
     clock.append(time.perf_counter())
     stages = zip(("project", "relight", "render"), clock, clock[1:])
     result = {"points": len(asset.points), "seconds": {name: round(b - a, 5) for name, a, b in stages}}
-    if chosen.points:
-        result |= _local_light_error(asset, chosen.points, local, opened, scene)
+    if chosen.point_lights:
+        result |= _local_light_error(asset, chosen.point_lights, nearest, opened, scene)
     return result
 
 
-def _local_light_error(asset, lights, local, opened, scene):
+def _local_light_error(asset, lights, nearest, opened, scene):
     """The entry local_light_error, or none where the scene is neither open nor needed, or not to be had."""
     if opened is None:
         warning = hull_warning(lights, asset.points.hull)
@@ -127,4 +124,4 @@ def _local_light_error(asset, lights, local, opened, scene):
         except SceneError as error:
             warnings.warn(f"{warning}; by how much it errs cannot be measured: {error}", LightWarning, stacklevel=3)
             return {}
-    return {"local_light_error": measure_error(asset, lights, local, opened)}
+    return {"local_light_error": measure_error(asset, lights, nearest, opened)}

@@ -14,6 +14,7 @@ from mi_prt.directions import parse_directions
 from mi_prt.evaluate.ground_truth import point_irradiance
 from mi_prt.info import describe, describe_asset
 from mi_prt.lighting.cells import cell_radiance
+from mi_prt.lighting.lattice import on_lattice
 from mi_prt.lighting.scene_light import lit_scene
 from mi_prt.scene.scene import open_scene
 from mi_prt.transport.direct import sample_direct
@@ -244,6 +245,27 @@ def test_prepared_light_keeps_local_lights(assets):
         expected = asset.irradiance(sky().rotated("y", 40)) + asset.irradiance(lamp)
         result = asset.irradiance(asset.prepare_light([sky(), lamp]).rotated("y", 40))
         assert relative_l2(result, expected) < 0.01
+
+
+def test_light_prepared_for_one_basis_is_light_to_all(assets):
+    """Harmonics prepared for an asset of harmonics are the map they came from to every other basis, in the integrator too."""
+    prepared = assets["sh"].prepare_light([sky(), mi_prt.PointLight((3, 4, 2), 50.0)]).rotated("y", 40)
+    for kind, asset in assets.items():
+        expected = asset.irradiance([sky().rotated("y", 40), mi_prt.PointLight((3, 4, 2), 50.0)])
+        assert relative_l2(asset.irradiance(prepared), expected) < 0.01, kind
+        assert relative_l2(asset.irradiance([prepared, prepared]), 2 * expected) < 0.01
+        assert relative_l2(asset.irradiance(asset.prepare_light(prepared)), expected) < 0.01
+    fewer = mi_prt.precompute(scene(**PARTS), directions="cubemap:16", edge_length=0.3, basis="sh", coefficients=16)
+    expected = fewer.irradiance([sky().rotated("y", 40), mi_prt.PointLight((3, 4, 2), 50.0)])
+    assert relative_l2(fewer.irradiance(prepared), expected) < 0.01
+
+
+@pytest.mark.parametrize("lattice", ["latlong:64x32", "latlong:4x600", "halton:1200", "cubemap:16"])
+def test_constant_light_stays_constant_when_it_turns(lattice):
+    """In every cell, those at the poles too, which are thinner than the fine lattice's cells."""
+    directions = parse_directions(lattice)
+    prepared = on_lattice(mi_prt.EnvironmentMap(np.full((8, 16, 3), 2.0)), directions).rotated((1, 2, 3), 33)
+    np.testing.assert_allclose(cell_radiance(prepared, directions), 2, rtol=1e-5)
 
 
 # --- storage -------------------------------------------------------------------------------------------------------

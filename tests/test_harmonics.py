@@ -11,7 +11,7 @@ from mi_prt import SettingsError
 from mi_prt.basis.harmonics import (
     MAX_BANDS,
     HarmonicBasis,
-    HarmonicLight,
+    HarmonicMap,
     check_harmonics,
     evaluate,
     fit_harmonics,
@@ -21,6 +21,7 @@ from mi_prt.basis.harmonics import (
 )
 from mi_prt.basis.rows import Rows
 from mi_prt.basis.target import Target, fit_of
+from mi_prt.lighting.lattice import LatticeMap
 from mi_prt.directions import Cubemap
 
 LATTICE = Cubemap(8)
@@ -323,19 +324,21 @@ def test_light_turned_in_the_basis_is_light_turned_in_the_cells(matrix):
     light = np.random.default_rng(0).random((len(LATTICE), 3)).astype(np.float32) ** 4
     turned = light[LATTICE.cells(LATTICE.vectors @ matrix)]  # L'(ω) = L(R⁻¹ω)
     expected = basis.project_light(turned)[0]
-    result = HarmonicLight(basis.project_light(light)[0], matrix).turned
+    result = HarmonicMap(None, (), basis.project_light(light)[0], matrix).turned()
     assert result.dtype == np.float32
     assert relative_l2(result, expected) < 1e-5
     assert relative_l2(basis.project_light(light)[0], expected) > 0.1
 
 
 def test_turns_of_light_add_up():
-    """The later turn is about the world's axes: turned about x, then about y. Local lights beside it stay."""
+    """The later turn is about the world's axes: turned about x, then about y. What is not turned is as it was."""
     coefficients = np.random.default_rng(0).standard_normal((49, 3)).astype(np.float32)
-    light = HarmonicLight(coefficients, points=("lamp",)).rotated("x", 20).rotated("y", 75)
-    assert relative_l2(light.turned, rotate(coefficients, turn("y", 75) @ turn("x", 20))) < 1e-6
-    assert light.points == ("lamp",)
-    np.testing.assert_allclose(HarmonicLight(coefficients).turned, coefficients, atol=1e-6)
+    environment = LatticeMap(Cubemap(1), np.ones((6, 3), np.float32), np.eye(3))
+    light = HarmonicMap(environment, ("cubemap:8", 49), coefficients)
+    np.testing.assert_allclose(light.turned(), coefficients, atol=1e-6)
+    turned = light.rotated("x", 20).rotated("y", 75)
+    assert relative_l2(turned.turned(), rotate(coefficients, turn("y", 75) @ turn("x", 20))) < 1e-6
+    np.testing.assert_allclose(turned.environment.rotation, turn("y", 75) @ turn("x", 20), atol=1e-12)
 
 
 # --- targets -------------------------------------------------------------------------------------------------------

@@ -1,8 +1,6 @@
-"""All bases by their names.
+"""All bases by their names."""
 
-Each offers what `LinearBasis` does (`encode`, `reconstruct`, `at`, `project_light`, `len`) and is made from its `ARRAYS`. Coefficients are
-whatever `coefficients @ light` and `coefficients[index]` work with: an array, a sparse array, or the sampled transport.
-"""
+from math import inf
 
 from ..errors import SettingsError
 from .haar import HaarBasis, SharedHaarBasis, check_haar, fit_haar, fit_haar_shared
@@ -23,7 +21,7 @@ def check_basis(kind):
         raise SettingsError(f"basis '{kind}' is not known: use {', '.join(BASES)}")
 
 
-def fit_basis(kind, rows, target, seed=0, progress=lambda done, total: None, **options):
+def fit_basis(kind, rows, target, seed=0, progress=lambda done, total: None, max_bytes=inf, keep=None):
     """Fit a basis that has components to choose (all but `none`) to rows of transport.
 
     Parameters
@@ -33,16 +31,23 @@ def fit_basis(kind, rows, target, seed=0, progress=lambda done, total: None, **o
     target : Target
     seed : int
     progress : callable(done, total)
-    **options
-        keep and max_bytes of `fit_pca`, the one fit that takes more than a pass or two.
+    max_bytes : float
+        Memory that the fit may take.
+    keep : callable(name, compute), optional
+        See `fit_pca`, the one fit that takes more than a pass or two.
 
     Returns
     -------
     Fit
+
+    Raises
+    ------
+    SettingsError
+        If the basis cannot be had in that number, on that lattice, or in that memory.
     """
     if kind == "pca":
-        return fit_pca(rows, target, seed, progress, **options)
-    return _FITS[kind](rows, target, seed, progress)
+        return fit_pca(rows, target, seed, progress, max_bytes, **({"keep": keep} if keep else {}))
+    return _FITS[kind](rows, target, seed, progress, max_bytes)
 
 
 def check_components(kind, directions, components):

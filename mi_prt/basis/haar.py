@@ -11,20 +11,21 @@ with aᵢ = √wᵢ tᵢ these are (√w₂ a₁ − √w₁ a₂)/√(w₁ + w�
 
 from dataclasses import dataclass
 from functools import cache, cached_property
-from math import log2, sqrt
+from math import inf, log2, sqrt
 
 import numpy as np
 import scipy.sparse
 
 from ..directions import MAX_CUBEMAP_RESOLUTION, Cubemap
 from ..errors import SettingsError
+from .basis import Basis
 from .linear import LinearBasis
 from .rows import Rows
-from .target import Fit, Target, centred, fit_of, shares
+from .target import Fit, Target, centred, check_room, fit_of, shares
 
 
 @dataclass(frozen=True, eq=False)
-class HaarBasis:
+class HaarBasis(Basis):
     """The k Haar wavelets of each transport row that matter most to it: the best approximation of the row by k of them.
 
     A row's coefficients are a row of a sparse matrix, which multiplied by the light's coefficients gives the irradiance.
@@ -213,7 +214,7 @@ def _merge_weights(first, second):
     return share[0]
 
 
-def fit_haar(rows: Rows, target: Target, seed=0, progress=lambda done, total: None) -> Fit:
+def fit_haar(rows: Rows, target: Target, seed=0, progress=lambda done, total: None, max_bytes=inf) -> Fit:
     """Find how many Haar wavelets a row are wanted, each row with its own, and how well they represent the rows.
 
     Parameters
@@ -226,6 +227,8 @@ def fit_haar(rows: Rows, target: Target, seed=0, progress=lambda done, total: No
         Not used: nothing is random.
     progress : callable(done, total)
         Called after the one pass over the rows.
+    max_bytes : float
+        Memory that the fit may take; this one takes next to nothing.
 
     Returns
     -------
@@ -259,10 +262,10 @@ def fit_haar(rows: Rows, target: Target, seed=0, progress=lambda done, total: No
     return fit_of(HaarBasis(rows.sqrt_weights, shares(energies[:components], variance)), residual, variance, energy)
 
 
-def fit_haar_shared(rows: Rows, target: Target, seed=0, progress=lambda done, total: None) -> Fit:
+def fit_haar_shared(rows: Rows, target: Target, seed=0, progress=lambda done, total: None, max_bytes=inf) -> Fit:
     """Find the one set of Haar wavelets that carries the most energy of all rows.
 
-    Parameters, progress and errors are those of `fit_haar`.
+    Parameters, progress and errors are those of `fit_haar`; the wavelets as functions must fit into `max_bytes`.
 
     Returns
     -------
@@ -287,6 +290,7 @@ def fit_haar_shared(rows: Rows, target: Target, seed=0, progress=lambda done, to
     variance = centred(energy, total, n)
     order = np.argsort(-energies, kind="stable")
     components, residual = _fewest(target, energies[order], variance)
+    check_room(f"a basis of {components:,} wavelets", 16 * components * s, max_bytes)
     chosen = order[:components]
     vectors = np.zeros((components, s), np.float32)
     vectors[np.arange(components), chosen] = 1

@@ -2,16 +2,17 @@
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from math import isqrt, pi, sqrt
+from math import inf, isqrt, pi, sqrt
 
 import numpy as np
 import scipy.linalg
 
 from ..errors import SettingsError
 from ..lighting.environment import rotation_matrix
+from ..lighting.light import Light
 from .linear import LinearBasis
 from .rows import Rows
-from .target import Fit, Target, centred, fit_of, shares
+from .target import Fit, Target, centred, check_room, fit_of, shares
 
 MAX_BANDS = 33  # 1,089 functions: far beyond what low-frequency light needs, and cheap to turn still
 FIRST_BANDS = 10  # where a search for a share of the variance starts
@@ -148,35 +149,70 @@ class HarmonicBasis(LinearBasis):
         vectors = self.vectors.astype(np.float64)
         return scipy.linalg.solve(vectors @ vectors.T, vectors, assume_a="pos").astype(np.float32)
 
+    def project(self, light, directions):
+        """Light (d, 3) float32 in the basis, and no mean response; maps that `prepare` returned are turned in closed form."""
+        functions = str(directions), len(self)
+        known = [m for m in light.maps if isinstance(m, HarmonicMap) and m.functions == functions]
+        others = replace(light, maps=tuple(m for m in light.maps if m not in known))
+        coefficients, mean = super().project(others, directions)
+        return sum((m.turned() for m in known), coefficients), mean
+
+    def prepare(self, light, directions):
+        """A `Light` whose maps turn in closed form."""
+        prepared = super().prepare(light, directions)
+        maps = tuple(
+            HarmonicMap(m, (str(directions), len(self)), super(HarmonicBasis, self).project(Light(light.maps), directions)[0])
+            for m in prepared.maps
+        )
+        return replace(prepared, maps=maps)
+
 
 @dataclass(frozen=True, eq=False)
-class HarmonicLight:
-    """Light in spherical harmonics, which turn in closed form.
+class HarmonicMap:
+    """Environment maps and their spherical harmonics, which turn in closed form.
+
+    To a `HarmonicBasis` of the same functions it is its coefficients, to everything else the map.
 
     Parameters
     ----------
+    environment : LatticeMap
+        As it is turned now.
+    functions : (str, int)
+        Lattice and number of the harmonics.
     coefficients : (d, 3) float32
-        ℓ before it is turned.
+        ℓ before anything is turned.
     rotation : (3, 3) float64
-    points : tuple
-        Local lights beside it; they stay where they are.
     """
 
+    environment: object
+    functions: tuple
     coefficients: np.ndarray
     rotation: np.ndarray = field(default_factory=lambda: np.eye(3))
-    points: tuple = ()
 
     def rotated(self, axis, degrees):
         """The same light turned about `axis` (x, y, z or a vector of 3) by `degrees`, right-handed."""
-        return replace(self, rotation=rotation_matrix(axis, degrees) @ self.rotation)
+        turn = rotation_matrix(axis, degrees)
+        return replace(self, environment=self.environment.rotated(axis, degrees), rotation=turn @ self.rotation)
 
-    @cached_property
     def turned(self):
         """ℓ (d, 3) float32 after the rotation."""
         return rotate(self.coefficients, self.rotation).astype(np.float32)
 
+    @property
+    def size(self):
+        """See `LatticeMap`."""
+        return self.environment.size
 
-def fit_harmonics(rows: Rows, target: Target, seed=0, progress=lambda done, total: None) -> Fit:
+    def at(self, vectors):
+        """See `LatticeMap`."""
+        return self.environment.at(vectors)
+
+    def quadrature(self, spacing):
+        """See `LatticeMap`."""
+        return self.environment.quadrature(spacing)
+
+
+def fit_harmonics(rows: Rows, target: Target, seed=0, progress=lambda done, total: None, max_bytes=inf) -> Fit:
     """Find how many bands are wanted and how well they represent the rows.
 
     A lattice tells functions apart as long as the eigenvalues of their Gram matrix over its directions stay above
@@ -191,6 +227,8 @@ def fit_harmonics(rows: Rows, target: Target, seed=0, progress=lambda done, tota
         Not used: nothing is random.
     progress : callable(done, total)
         Called after every pass over the rows, which is the only one unless a large share of the variance is asked for.
+    max_bytes : float
+        Memory that the fit may take.
 
     Returns
     -------
@@ -201,8 +239,10 @@ def fit_harmonics(rows: Rows, target: Target, seed=0, progress=lambda done, tota
     ------
     SettingsError
         If the number of components is not a square, or above what the lattice tells apart or `MAX_BANDS` gives, or if that
-        many bands do not capture the share of the variance.
+        many bands do not capture the share of the variance, or need more than `max_bytes`.
     """
+    largest = MAX_BANDS**2 if target.components is None else target.components
+    check_room(f"a basis of {largest:,} spherical harmonics", 32 * largest * rows.shape[1], max_bytes)
     functions, gram = _functions(rows.directions, target.components)
     most = isqrt(len(functions))
     bands = most if target.variance is None else min(FIRST_BANDS, most)

@@ -5,9 +5,11 @@ from functools import cached_property
 
 import numpy as np
 
+from .basis import Basis
+
 
 @dataclass(frozen=True, eq=False)
-class LinearBasis:
+class LinearBasis(Basis):
     """A basis of d rows in the √w-weighted space, and a mean.
 
     A transport row is T ≈ mean + (c · vectors)/√w with c = ((T − mean)·√w) · dualsᵀ. Under cell radiance L the
@@ -28,7 +30,6 @@ class LinearBasis:
     sqrt_weights: np.ndarray
     captured_variance: np.ndarray
 
-    kind = "linear"
     ARRAYS = ("vectors", "mean", "sqrt_weights", "captured_variance")
 
     def __len__(self):

@@ -4,9 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .basis import Basis
+
 
 @dataclass(frozen=True, eq=False)
-class NoBasis:
+class NoBasis(Basis):
     """Coefficients are the sampled transport itself.
 
     Parameters

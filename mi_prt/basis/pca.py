@@ -16,10 +16,10 @@ Two ways lead to them, and the cheaper one for the shape at hand is taken:
 import numpy as np
 import scipy.linalg
 
-from ..parallel import BLOCK_ROWS, one_blas_thread
+from ..parallel import map_chunks, one_blas_thread
 from .linear import LinearBasis
 from .rows import Rows
-from .target import Fit, Target, fit_of
+from .target import Fit, Target, check_room, fit_of
 
 OVERSAMPLING = 16
 SAMPLE_ITERATIONS = 2  # power iterations on a quarter of the rows, which find nearly the subspace of all
@@ -30,7 +30,10 @@ FIRST_COMPONENTS = 64  # where a search for a share of the variance starts
 # Seconds on two cores, of which only the ratios matter: for each element of a row and column of the subspace, for each element
 # of a row, for each product of the Gram matrix, and for each s³ of its decomposition.
 ITERATION_COST, ROW_COST, GRAM_COST, DECOMPOSITION_COST = 1.3e-10, 4e-9, 2e-11, 6e-11
+GRAM_BYTES = 40  # for each entry of a Gram matrix: the sum, parts of it that some threads have ready, the decomposition
+GRAM_ROWS = 1024  # rows of one product: fewer would pass over the Gram matrix too often
 NEGLIGIBLE = 0.5  # seconds that exactness is worth
+ITERATION_BYTES = 72  # for each direction and column of the subspace: sums of some threads in float64, and the orthonormalization
 
 
 class PCA(LinearBasis):
@@ -47,7 +50,7 @@ class PCA(LinearBasis):
         return compensated @ (self.vectors @ (radiance * self.sqrt_weights[:, None]))
 
 
-def fit_pca(rows, target, seed=0, progress=lambda done, total: None, keep=lambda name, compute: compute(), max_bytes=np.inf):
+def fit_pca(rows, target, seed=0, progress=lambda done, total: None, max_bytes=np.inf, keep=lambda name, compute: compute()):
     """Fit principal components to a matrix that is only ever seen in blocks of rows.
 
     Parameters
@@ -59,15 +62,20 @@ def fit_pca(rows, target, seed=0, progress=lambda done, total: None, keep=lambda
         Of the random start.
     progress : callable(done, total)
         Called after every pass over the rows.
+    max_bytes : float
+        Memory that the fit may take. Where a Gram matrix does not fit into it, the iteration is used whatever it costs.
     keep : callable(name, compute) returning an array
         Called for what each pass over the rows gives, so that a caller may store and restore it; `name` tells the pass.
-    max_bytes : float
-        Memory that a Gram matrix may take; above it the iteration is used whatever it costs.
 
     Returns
     -------
     Fit
         Of a `PCA`.
+
+    Raises
+    ------
+    SettingsError
+        If neither way fits into `max_bytes`.
     """
     mean, squares = _unpacked(keep("moments", lambda: np.append(*rows.moments())))
     n, s = rows.shape
@@ -102,12 +110,16 @@ def _leading(rows, mean, components, seed, progress, keep, max_bytes):
     subspace = components + max(OVERSAMPLING, components // 4)
     n, s = rows.shape
     side = min(n, s)
-    gram_bytes = 16 * side**2 + (8 * n * s if n < s else 0)
+    gram_bytes = GRAM_BYTES * side**2 + (16 * n * s if n < s else 0)
+    iteration_bytes = ITERATION_BYTES * s * subspace
     iteration = n * s * (subspace * ITERATION_COST + ROW_COST)
     gram = n * s * side * GRAM_COST + side**3 * DECOMPOSITION_COST
+    fits = gram_bytes <= max_bytes
     # Subspaces that together reach a large part of the space are no smaller problem than the whole.
-    if 2 * subspace > side or (gram_bytes <= max_bytes and gram <= max(iteration, NEGLIGIBLE)):
+    if 2 * subspace > side or (fits and (gram <= max(iteration, NEGLIGIBLE) or iteration_bytes > max_bytes)):
+        check_room(f"a Gram matrix for {components:,} components", gram_bytes, max_bytes)
         return _exact(rows, mean, components, progress)
+    check_room(f"fitting {components:,} components", iteration_bytes, max_bytes)
     return _subspace_iteration(rows, mean, components, subspace, seed, progress, keep)
 
 
@@ -171,23 +183,29 @@ def _exact(rows, mean, components, progress):
     if components == 0:
         return np.zeros(0), np.zeros((s, 0))
     keep = [min(n, s) - components, min(n, s) - 1]
+    chunks = np.array_split(rows.index, -(-n // GRAM_ROWS))
 
-    def centred():
-        total = -(-n // BLOCK_ROWS)
-        for done, block in enumerate(rows.blocks(), start=1):
-            yield block.astype(np.float64) * rows.sqrt_weights - mean
-            progress(done, total)
+    def centred(chunk):
+        return np.concatenate([block * rows.sqrt_weights for block in rows.blocks(chunk)]).astype(np.float64) - mean
+
+    def reported(parts):
+        for done, part in enumerate(parts, start=1):
+            progress(done, len(chunks))
+            yield part
 
     if s <= n:
         gram = np.zeros((s, s))
-        for block in centred():
-            gram += block.T @ block
-        values, vectors = scipy.linalg.eigh(gram, subset_by_index=keep, overwrite_a=True)
+        for part in reported(map_chunks(lambda chunk: (block := centred(chunk)).T @ block, chunks)):
+            gram += part
+        with one_blas_thread():
+            values, vectors = scipy.linalg.eigh(gram, subset_by_index=keep, overwrite_a=True)
         return np.maximum(values[::-1], 0), vectors[:, ::-1]
-    matrix = np.concatenate(list(centred()))
-    values, left = scipy.linalg.eigh(matrix @ matrix.T, subset_by_index=keep, overwrite_a=True)
-    values, left = np.maximum(values[::-1], 0), left[:, ::-1]
-    return values, matrix.T @ left / np.maximum(np.sqrt(values), 1e-300)
+    matrix = np.concatenate(list(reported(map_chunks(centred, chunks))))
+    gram = np.concatenate(list(map_chunks(lambda part: part @ matrix.T, np.array_split(matrix, len(chunks)))))
+    with one_blas_thread():
+        values, left = scipy.linalg.eigh(gram, subset_by_index=keep, overwrite_a=True)
+        values, left = np.maximum(values[::-1], 0), left[:, ::-1]
+        return values, matrix.T @ left / np.maximum(np.sqrt(values), 1e-300)
 
 
 def _fixed_signs(vectors):

@@ -95,3 +95,12 @@ def centred(energy, total, count):
 def shares(energies, variance):
     """Energies (d,) over the variance; 0 where nothing varies."""
     return energies / variance if variance > 0 else np.zeros(len(energies))
+
+
+def check_room(what, needed, room):
+    """Raise SettingsError where something needs more bytes than there is room for."""
+    if needed > room:
+        raise SettingsError(
+            f"{what} needs {needed / 1e6:,.0f} MB, and of max_memory (--max-memory) {max(room, 0) / 1e6:,.0f} MB are left: raise it, "
+            "or use fewer coefficients or directions"
+        )

@@ -41,8 +41,8 @@ def compare(
     asset : Asset
     folder : path
         Gets report.json, index.html, EXRs and PNGs; created if need be.
-    light : what `as_light` accepts, optional
-        By default the scene's own distant light.
+    light : what `as_light` accepts, or a list of such and 'scene', optional
+        By default 'scene', the scene's own distant light.
     rotate : (axis, degrees), optional
         Turns the distant light.
     scene : path, dict or mi.Scene, optional
@@ -83,10 +83,7 @@ def compare(
 
     progress("relight", 0, 3)
     started = time.perf_counter()
-    irradiance = asset.irradiance(chosen_light.distant)
-    if chosen_light.points:
-        local = asset.local_irradiance(chosen_light.points, nearest)
-        irradiance += local
+    irradiance = asset.irradiance_from(*asset.project_light(chosen_light), chosen_light.point_lights, nearest)
     seconds["relight"] = time.perf_counter() - started
 
     progress("reference at the points", 1, 3)
@@ -107,6 +104,7 @@ def compare(
         "scene": opened.source.path,
         "reference": reference,
         "left_out": asset.scene["left_out"],
+        "basis": asset.basis.kind,
         "coefficients": len(asset.basis),
         "directions": len(asset.directions),
         "captured_variance": asset.report["captured_variance"],
@@ -114,8 +112,8 @@ def compare(
         "image": _image_errors(result, expected, covered),
         "seconds": {name: round(value, 4) for name, value in seconds.items()},
     }
-    if chosen_light.points:
-        report["local_light_error"] = measure_error(asset, chosen_light.points, local, opened, seed)
+    if chosen_light.point_lights:
+        report["local_light_error"] = measure_error(asset, chosen_light.point_lights, nearest, opened, seed)
     write_report(folder, report, result, expected.mean, covered)
     return report
 

@@ -11,15 +11,15 @@ from . import ground_truth, metrics
 MEASURED_POINTS = 4096
 
 
-def measure_error(asset, lights, irradiance, scene, seed=0):
+def measure_error(asset, lights, nearest, scene, seed=0):
     """Measure the error of local lights, and warn with it of those that stand inside the scene's convex hull.
 
     Parameters
     ----------
     asset : Asset
     lights : tuple of PointLight
-    irradiance : (n, 3)
-        As `Asset.local_irradiance` gives it.
+    nearest : int
+        Directions that stand for a light.
     scene : Scene
         That of the asset.
     seed : int
@@ -36,6 +36,7 @@ def measure_error(asset, lights, irradiance, scene, seed=0):
         If a light is inside the hull.
     """
     chosen = np.sort(np.random.default_rng(seed).permutation(len(asset.points))[:MEASURED_POINTS])
+    irradiance = asset.local_irradiance(lights, nearest)
     truth = ground_truth.local_irradiance(scene.occluders, asset.points.at(chosen), lights)
     error = {
         "relative_rmse": metrics.relative_rmse(irradiance[chosen], truth),

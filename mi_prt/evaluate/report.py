@@ -118,10 +118,17 @@ def _causes(report):
         f"Reference noise: {report['points']['reference_noise']:.2%} at the points and "
         f"{report['image']['reference_noise']:.2%} in the image are Mitsuba's own; more spp lower them."
     )
-    yield (
-        f"Compression: {1 - report['captured_variance']:.2%} of the transport's variance is not in the basis; "
-        "more coefficients lower it."
-    )
+    if report["basis"] != "none":
+        yield (
+            f"Compression: {1 - report['captured_variance']:.2%} of the transport's variance is not in the basis ({report['basis']}); "
+            "more coefficients lower it."
+        )
+    if "local_light_error" in report:
+        local = report["local_light_error"]
+        yield (
+            f"Local lights: {local['relative_rmse']:.1%} relative RMSE and {local['bias']:+.1%} bias by themselves. They are seen through "
+            "the nearest directions of the lattice, and where they stand inside the scene's convex hull, with visibility to infinity."
+        )
     yield (
         f"Directions: light and shadows are averaged over cells of "
         f"{np.degrees(np.sqrt(4 * np.pi / report['directions'])):.1f}°, which blurs the shadow of a small sun."

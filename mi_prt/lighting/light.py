@@ -1,11 +1,15 @@
 """Light of any kind, distant and local: what counts as light, and sums of it."""
 
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 
 from ..errors import LightError
 from .environment import EnvironmentMap, rotation_matrix
+
+
+KINDS = "an environment map (a path, an array (h, w, 3), a mi.Bitmap or EnvironmentMap), a DirectionalLight, PointLight or Light"
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,17 +82,17 @@ class Light:
     ----------
     maps : tuple of EnvironmentMap
     directionals : tuple of DirectionalLight
-    points : tuple of PointLight
+    point_lights : tuple of PointLight
     """
 
     maps: tuple = field(default=())
     directionals: tuple = field(default=())
-    points: tuple = field(default=())
+    point_lights: tuple = field(default=())
 
     @property
     def distant(self):
         """The same without its local lights."""
-        return replace(self, points=())
+        return replace(self, point_lights=())
 
     def rotated(self, axis, degrees):
         """The same light turned about `axis` (x, y, z or a vector of 3) by `degrees`, right-handed.
@@ -120,15 +124,17 @@ def as_light(light):
     if isinstance(light, DirectionalLight):
         return Light(directionals=(light,))
     if isinstance(light, PointLight):
-        return Light(points=(light,))
+        return Light(point_lights=(light,))
     if isinstance(light, EnvironmentMap):
         return Light(maps=(light,))
-    if not isinstance(light, list | tuple):
+    if isinstance(light, str | Path | np.ndarray) or type(light).__module__.startswith("mitsuba"):
         return Light(maps=(EnvironmentMap(light),))
+    if not isinstance(light, list | tuple):
+        raise LightError(f"light must be {KINDS}, or a list of these, got {light!r}")
     if not light:
         raise LightError("the list of lights is empty: pass one light at least")
     parts = [as_light(part) for part in light]
-    return Light(*(sum((getattr(part, kind) for part in parts), ()) for kind in ("maps", "directionals", "points")))
+    return Light(*(sum((getattr(part, kind) for part in parts), ()) for kind in ("maps", "directionals", "point_lights")))
 
 
 def _rgb(what, value):

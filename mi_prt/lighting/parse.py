@@ -6,7 +6,7 @@ from ..errors import LightError, SettingsError
 from .environment import EnvironmentMap
 from .light import DirectionalLight, PointLight
 
-FORMS = "point:x,y,z:r,g,b, directional:dx,dy,dz:r,g,b (direction of travel), envmap:FILE or envmap:FILE:AXIS:DEGREES"
+FORMS = "scene (its own), point:x,y,z:r,g,b, directional:dx,dy,dz:r,g,b (direction of travel), envmap:FILE or envmap:FILE:AXIS:DEGREES"
 _TURNED_FILE = re.compile(r"(.+?):([xyz]|[^:,]+,[^:,]+,[^:,]+):([^:]+)")
 
 
@@ -16,19 +16,21 @@ def parse_light(text):
     Parameters
     ----------
     text : str
-        ``point:x,y,z:r,g,b`` with the intensity in W/sr, ``directional:dx,dy,dz:r,g,b`` with the direction in which the
+        ``scene`` (the scene's own distant light), ``point:x,y,z:r,g,b`` with the intensity in W/sr, ``directional:dx,dy,dz:r,g,b`` with the direction in which the
         light travels and the irradiance in W/m², ``envmap:FILE`` or ``envmap:FILE:AXIS:DEGREES``. A single number in the
         place of r,g,b is grey.
 
     Returns
     -------
-    PointLight, DirectionalLight or EnvironmentMap
+    PointLight, DirectionalLight, EnvironmentMap or 'scene'
 
     Raises
     ------
     LightError
         If it is of no such form, or such a light cannot be: see the classes.
     """
+    if text == "scene":
+        return text
     kind, _, rest = text.partition(":")
     try:
         if kind == "envmap" and rest:

@@ -10,6 +10,7 @@ from ..scene.traversal import children, transform_of
 from .environment import EnvironmentMap
 from .light import DirectionalLight, Light, as_light
 
+SCENE = "scene"  # the scene's own distant light, in a list of lights
 BAKED_HEIGHT = 512  # rows of the map that an analytic sky is baked to
 SKY_SAMPLES = 8  # samples of every pixel
 SUN_SAMPLES = 1 << 24  # samples shared by the pixels in which a sun was found
@@ -36,7 +37,7 @@ def scene_light(scene):
         If the scene has no distant emitter, or one holds NaN, infinite or negative radiance.
     """
     if not scene.distant_emitters:
-        raise LightError("the scene has no distant light (envmap, constant, sunsky, directional): pass an environment map")
+        raise LightError("the scene has no distant light (envmap, constant, sunsky, directional): pass a light")
     return emitters_light(scene.distant_emitters)
 
 
@@ -90,8 +91,8 @@ def turned_light(scene, light=None, rotate=None):
     Parameters
     ----------
     scene : Scene or None
-        Whose own distant light is taken where `light` is None; not needed otherwise.
-    light : what `as_light` accepts, optional
+        Whose own distant light is taken where `light` is None, or in the place of 'scene' in a list; not needed otherwise.
+    light : what `as_light` accepts, or a list of such and 'scene', optional
     rotate : (axis, degrees), optional
         Turns the distant light.
 
@@ -102,10 +103,22 @@ def turned_light(scene, light=None, rotate=None):
     chosen : Light
         What the asset is lit by.
     """
-    chosen = scene_light(scene) if light is None else as_light(light)
+    if is_of_scene(light):
+        chosen = as_light([scene_light(scene) if is_of_scene(part) else part for part in _listed(light)])
+    else:
+        chosen = as_light(light)
     if rotate is not None:
         chosen = chosen.rotated(*rotate)
     return (None if light is None and rotate is None else chosen), chosen
+
+
+def is_of_scene(light):
+    """Whether a light, as `turned_light` takes it, contains the scene's own."""
+    return any(part is None or (isinstance(part, str) and part == SCENE) for part in _listed(light))
+
+
+def _listed(light):
+    return light if isinstance(light, list | tuple) else [light]
 
 
 def summed_maps(maps):
@@ -163,7 +176,7 @@ def _emitters(light):
             "direction": [float(x) for x in source.direction],
             "irradiance": _spectrum(source.irradiance),
         }
-    for i, source in enumerate(light.points):
+    for i, source in enumerate(light.point_lights):
         emitters[f"point{i}"] = point_emitter(source)
     return emitters
 
