@@ -352,7 +352,7 @@ def test_a_loaded_merged_scene_gives_the_same_light():
 
 def test_a_scene_without_distant_light_says_what_to_do():
     for lights in ({}, {"bulb": {"type": "point"}}):
-        with pytest.raises(LightError, match="environment map"):
+        with pytest.raises(LightError, match="pass a light"):
             scene_light(open_scene(scene(floor=rectangle(), **lights)))
 
 
