@@ -156,15 +156,21 @@ class Asset:
 
     # --- file ----------------------------------------------------------------------------------------------------
 
-    def save(self, path):
+    def save(self, path, folder=None):
         """Write the asset to one file, all or nothing; see `asset_file`.
+
+        Parameters
+        ----------
+        path : path
+        folder : path, optional
+            Where the file is until it is whole: on the same file system, by default in the folder of `path`.
 
         Raises
         ------
         SettingsError
             If the path cannot be written.
         """
-        asset_file.write(self, path)
+        asset_file.write(self, path, folder)
         object.__setattr__(self, "path", Path(path).absolute())
 
 

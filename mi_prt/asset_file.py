@@ -12,6 +12,7 @@ import numpy as np
 import scipy.sparse
 
 from .basis.bases import BASES
+from .basis.haar import row_ends
 from .directions import parse_directions
 from .errors import AssetError
 from .files import replacing
@@ -36,8 +37,15 @@ _TEXTS = ("scene", "settings", "versions", "report")
 _OVERHEAD = 1 << 20  # bytes of a file beside its arrays: structure, and texts up to that length
 
 
-def write(asset, path):
+def write(asset, path, folder=None):
     """Write an `Asset` to one file, all or nothing.
+
+    Parameters
+    ----------
+    asset : Asset
+    path : path
+    folder : path, optional
+        Where the file is until it is whole, see `replacing`.
 
     Raises
     ------
@@ -49,7 +57,7 @@ def write(asset, path):
     arrays = _arrays(asset)
     texts = {name: json.dumps(getattr(asset, name), sort_keys=True) for name in _TEXTS}
     size = sum(a.nbytes for a in arrays.values()) + sum(map(len, texts.values())) + _OVERHEAD
-    with replacing(path) as temporary, _ReservedFile(temporary, size) as stream:
+    with replacing(path, folder) as temporary, _ReservedFile(temporary, size) as stream:
         with h5py.File(stream, "w") as file:
             file.attrs["format"] = FORMAT
             file.attrs["format_version"] = FORMAT_VERSION
@@ -213,7 +221,7 @@ def _read_coefficients(file, points, directions):
     if values.shape != index.shape or (index >= directions).any():
         raise ValueError("coefficients/values and indices do not fit together")
     n, k = values.shape
-    return scipy.sparse.csr_array((values.ravel(), index.ravel().astype(np.int32), k * np.arange(n + 1)), (n, directions))
+    return scipy.sparse.csr_array((values.ravel(), index.ravel().astype(np.int32), row_ends(n, k)), (n, directions))
 
 
 def _check_shapes(points, buried, directions, basis, coefficients):

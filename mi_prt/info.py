@@ -6,10 +6,11 @@ from dataclasses import asdict
 import numpy as np
 
 from .asset_file import coefficient_arrays
+from .basis.bases import coefficient_bytes, fit_bytes
 from .directions import parse_directions
 from .parallel import BLOCK_ROWS
 from .points.points import POINT_BUDGET, sample_points
-from .precompute import LANE_BYTES, Settings, coefficient_bytes
+from .precompute import LANE_BYTES, POINT_BYTES, Settings
 from .provenance import left_out
 from .runtime import peak_memory_bytes
 from .scene.scene import open_scene

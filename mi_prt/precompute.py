@@ -4,12 +4,21 @@ import hashlib
 import time
 from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass
+from pathlib import Path
 
 import numpy as np
 import scipy.sparse
 
 from .asset import Asset
-from .basis.bases import check_basis, check_components, default_components, fit_basis, most_components
+from .basis.bases import (
+    check_basis,
+    check_components,
+    coefficient_bytes,
+    default_components,
+    fit_basis,
+    fit_bytes,
+    most_components,
+)
 from .basis.none import NoBasis
 from .basis.rows import Rows
 from .basis.target import Fit, Target, check_room
@@ -26,8 +35,10 @@ from .workspace import durable, temporary
 
 DEFAULT_VARIANCE = 0.95
 MAX_RAYS_PER_DIRECTION = 64
-LANE_BYTES = 80  # of a wavefront, for each of its rays
+LANE_BYTES = 40  # of a wavefront, for each of its rays
+POINT_BYTES = 240  # for each point, what the ray tracer and the fit hold of it beside the points themselves
 LEAST_LANES = 1 << 16
+OPEN_KEYS = ("coefficients", "variance")  # what may be chosen anew when the fit could not give what was asked for
 
 
 @dataclass(frozen=True)
@@ -68,16 +79,31 @@ class Settings:
 
     def __post_init__(self):
         lattice = parse_directions(self.directions)
-        object.__setattr__(self, "directions", str(lattice))
+        plain = {"directions": str(lattice)}
         check_basis(self.basis)
         for name, others in (("coefficients", (None, "auto")), ("rays_per_direction", ()), ("seed", ())):
             value = getattr(self, name)
-            if value not in others and (isinstance(value, bool) or not isinstance(value, int | np.integer)):
+            if any(value is other or (isinstance(value, str) and value == other) for other in others):
+                continue
+            if isinstance(value, bool) or not isinstance(value, int | np.integer):
                 raise SettingsError(f"{name} must be an integer{' or auto' if others else ''}, got {value!r}")
+            plain[name] = int(value)
+        for name in ("variance", "edge_length"):
+            value = getattr(self, name)
+            if value is not None and not (name == "edge_length" and isinstance(value, str) and value == "auto"):
+                plain[name] = _number(name, value)
+        # Plain values of one type each: they are stored, and compared when a run is continued.
+        for name, value in plain.items():
+            object.__setattr__(self, name, value)
         if not 1 <= self.rays_per_direction <= MAX_RAYS_PER_DIRECTION:
             raise SettingsError(f"rays per direction must be 1…{MAX_RAYS_PER_DIRECTION}, got {self.rays_per_direction}")
         if self.seed < 0:
             raise SettingsError(f"seed must be ≥ 0, got {self.seed}")
+        self._check_coefficients(lattice)
+
+    def _check_coefficients(self, lattice):
+        if self.basis == "none" and self.coefficients is not None:
+            raise SettingsError(f"the basis none keeps all directions, so coefficients {self.coefficients} mean nothing: leave them out")
         if self.coefficients == "auto":
             if self.variance is None:
                 object.__setattr__(self, "variance", DEFAULT_VARIANCE)
@@ -86,8 +112,6 @@ class Settings:
             raise SettingsError(f"variance {self.variance:g} needs coefficients auto, got {self.coefficients or 'the default'}")
         elif self.coefficients is not None and self.coefficients < 0:
             raise SettingsError(f"coefficients must be ≥ 0, got {self.coefficients}")
-        if self.basis == "none" and self.coefficients is not None:
-            raise SettingsError(f"the basis none keeps all directions, so coefficients {self.coefficients} mean nothing: leave them out")
         check_components(self.basis, lattice, None if self.coefficients == "auto" else self.coefficients)
 
     def target(self, points):
@@ -104,6 +128,13 @@ class Settings:
                 f"{len(directions):,} directions allow at most {largest}"
             )
         return Target(int(self.coefficients))
+
+
+def _number(name, value):
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        raise SettingsError(f"{name} must be a number, got {value!r}") from None
 
 
 def precompute(scene, parameters=None, progress=None, output=None, resume=False, max_memory=None, **settings):
@@ -150,16 +181,23 @@ def measure(scene, parameters=None, progress=None, output=None, resume=False, ma
         rays, kernels (compiled), peak_memory_bytes, seconds{scene, points, transport, basis, write} of this run alone.
     """
     settings = Settings(**settings)
+    if output is not None:
+        output = Path(output).resolve()
+    elif resume:
+        raise SettingsError("resume needs the output of the run to continue")
     limit = parse_bytes(max_memory) if max_memory is not None else resident_bytes() + free_bytes() // 2
     progress = progress or (lambda stage, done, total, detail="": None)
     clock = _Clock()
     with count_kernels() as kernels:
         scene = open_scene(scene, parameters)
         description = describe_scene(scene)
+        if output is not None and scene.source.path and output == Path(scene.source.path).resolve():
+            raise SettingsError(f"output '{output}' is the scene itself: give another name")
         clock.lap("scene")
         points = sample_points(scene, settings.edge_length)
         directions = parse_directions(settings.directions)
         target = settings.target(len(points))
+        scene.occluders  # noqa: B018  built before memory is measured: it holds a copy of all triangles
         room = Room(limit, points, directions, settings, target)
         clock.lap("points")
         run = _identity(settings, scene, points)
@@ -169,7 +207,7 @@ def measure(scene, parameters=None, progress=None, output=None, resume=False, ma
                 _sample(sampler, bits, room.lanes, progress)
                 transport = sampler.transport(bits)
                 dark = transport.dark()
-                buried = find_buried(scene, points, dark)
+                buried = find_buried(scene, points, dark, room.lanes)
                 clock.lap("transport")
                 fit, coefficients = _compress(transport, directions, buried, settings, target, room, workspace, run, progress)
                 clock.lap("basis")
@@ -191,7 +229,7 @@ def measure(scene, parameters=None, progress=None, output=None, resume=False, ma
                 },
             )
             if output is not None:
-                asset.save(output)
+                asset.save(output, workspace.folder)
                 clock.lap("write")
     cost = {
         "rays": transport.rays,
@@ -204,7 +242,7 @@ def measure(scene, parameters=None, progress=None, output=None, resume=False, ma
 
 @contextmanager
 def _workspace(output, run, resume):
-    with temporary() if output is None else durable(output, run, resume) as workspace:
+    with temporary() if output is None else durable(output, run, resume, OPEN_KEYS) as workspace:
         yield workspace
 
 
@@ -243,28 +281,19 @@ class Room:
 
     def __init__(self, limit, points, directions, settings, target):
         held = resident_bytes()
-        blocks = 16 * BLOCK_ROWS * len(directions) * settings.rays_per_direction * (thread_count() + 1)
-        coefficients = coefficient_bytes(
-            settings.basis, len(points), len(directions), target.components or 0, settings.rays_per_direction
-        )
-        kept = 160 * len(points) + blocks + 2 * coefficients
-        free = limit - held - kept
-        least = LANE_BYTES * LEAST_LANES
-        if free < least:
+        n, s, rays = len(points), len(directions), settings.rays_per_direction
+        components = target.components or 0
+        coefficients = coefficient_bytes(settings.basis, n, s, components, rays)
+        blocks = BLOCK_ROWS * s * (6 * rays + 12) * thread_count()
+        fixed = POINT_BYTES * n + blocks + 2 * coefficients
+        needed = fixed + fit_bytes(settings.basis, n, s, components) + LANE_BYTES * LEAST_LANES
+        if limit - held < needed:
             raise SettingsError(
                 f"memory {limit / 1e6:,.0f} MB is too little: the scene holds {held / 1e6:,.0f} MB and the run needs "
-                f"{(kept + least) / 1e6:,.0f} MB more; raise max_memory (--max-memory) or use fewer points, directions or coefficients"
+                f"{needed / 1e6:,.0f} MB more; raise max_memory (--max-memory) or use fewer points, directions or coefficients"
             )
-        self.lanes = int(min(LANES, free // LANE_BYTES))
-        self.basis = free
-
-
-def coefficient_bytes(basis, points, directions, components, rays_per_direction=1):
-    """Bytes of the coefficients of all points, as they are stored."""
-    if basis == "none":
-        return points * -(-directions * rays_per_direction // 16)
-    index = (2 if directions <= 1 << 16 else 4) if basis == "haar" else 0
-    return points * components * (4 + index)
+        self.lanes = int(min(LANES, (limit - held - fixed) // LANE_BYTES))
+        self.basis = limit - held - fixed
 
 
 def _sample(sampler, bits, lanes, progress):
@@ -287,23 +316,29 @@ def _compress(transport, directions, buried, settings, target, room, workspace, 
         basis = NoBasis(directions.solid_angles.astype(np.float32))
         return Fit(basis, 1.0, 0.0), transport.in_memory()
     kept = np.flatnonzero(~buried) if not buried.all() else np.arange(n)
-    fit = fit_basis(
-        settings.basis,
-        Rows(transport.rows, kept, directions),
-        target,
-        settings.seed,
-        lambda *done: progress("basis", *done, ""),
-        keep=workspace.keep,
-        max_bytes=room.basis,
-    )
-    if settings.coefficients not in (None, "auto") and len(fit.basis) < settings.coefficients:
-        # Another number may be asked for when the run is continued.
-        workspace.record({key: value for key, value in run.items() if key != "coefficients"})
-        raise SettingsError(
-            f"{settings.coefficients} coefficients are above the rank of the transport: at most {len(fit.basis)}"
+    try:
+        fit = fit_basis(
+            settings.basis,
+            Rows(transport.rows, kept, directions),
+            target,
+            settings.seed,
+            lambda *done: progress("basis", *done, ""),
+            room.basis,
+            workspace.keep,
         )
-    size = coefficient_bytes(settings.basis, *transport.shape, len(fit.basis))
-    check_room(f"{len(fit.basis):,} coefficients of {n:,} points", 2 * size, room.basis)
+        if settings.coefficients not in (None, "auto") and len(fit.basis) < settings.coefficients:
+            raise SettingsError(
+                f"{settings.coefficients} coefficients are above the rank of the transport: at most {len(fit.basis)}"
+            )
+        if target.components is None:
+            size = 2 * coefficient_bytes(settings.basis, *transport.shape, len(fit.basis))
+            check_room(f"keeping {len(fit.basis):,} coefficients of {n:,} points", size, room.basis)
+    except SettingsError as error:
+        if not workspace.lasting:
+            raise
+        # Only the fit could tell. The rays are kept for another choice of coefficients, or more memory.
+        workspace.record({key: value for key, value in run.items() if key not in OPEN_KEYS})
+        raise SettingsError(f"all rays are traced and kept, resume (--resume) goes on from them, but {error}") from None
     return fit, _encode(fit.basis, transport, progress)
 
 

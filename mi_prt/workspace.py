@@ -1,8 +1,8 @@
 """Durable intermediate results: what a killed run had computed is there for the next one.
 
 A workspace is a folder beside the output. Nothing in it is believed without proof: rows are listed in a journal with their
-checksums after they are written, arrays are renamed into place when they are whole, and the folder belongs to one process,
-one scene and one choice of settings. The output itself appears only when it is complete.
+checksums after they are written, arrays carry theirs and are renamed into place when they are whole, and the folder belongs to
+one process, one scene and one choice of settings. The output itself appears only when it is complete.
 """
 
 import fcntl
@@ -22,6 +22,8 @@ from .files import check_writable
 
 SUFFIX = ".partial"
 _RUN = "run.json"
+_OURS = (".rows", ".journal", ".array", ".new", ".part")
+_CHECKSUM_BYTES = 4
 
 
 class Workspace:
@@ -30,21 +32,22 @@ class Workspace:
     Parameters
     ----------
     folder : Path
+    lasting : bool
+        Whether it stays when the run fails.
     """
 
-    def __init__(self, folder):
-        self.folder = folder
+    def __init__(self, folder, lasting):
+        self.folder, self.lasting = folder, lasting
 
     def keep(self, name, compute):
         """The array that was stored by this name, or else that of `compute()`, stored."""
-        path = self.folder / f"{name}.npy"
-        try:
-            return np.load(path)
-        except (OSError, ValueError, EOFError):
+        path = self.folder / f"{name}.array"
+        array = _stored(path)
+        if array is None:
             array = compute()
-        content = io.BytesIO()
-        np.save(content, array)
-        _write_whole(path, content.getvalue())
+            content = io.BytesIO()
+            np.save(content, array)
+            _write_whole(path, content.getvalue() + _checksum(content.getvalue()))
         return array
 
     def rows(self, name, count, row_bytes):
@@ -77,15 +80,16 @@ class RowFile:
 
     def __init__(self, path, count, row_bytes):
         self.count, self.row_bytes = count, row_bytes
-        self._file = open(path, "a+b")
-        self._journal = open(path.with_suffix(".journal"), "a+b")
-        self.filled = self._restored()
+        with _typed(path):
+            self._file = open(path, "a+b", buffering=0)
+            self._journal = open(path.with_suffix(".journal"), "a+b", buffering=0)
+            self.filled = self._restored()
 
     def _restored(self):
         """Rows that were written whole; what follows them is cut off."""
         filled = listed = 0
         self._journal.seek(0)
-        for line in self._journal:
+        for line in self._journal.read().splitlines(keepends=True):
             try:
                 size, checksum = (int(word) for word in line.split())
                 whole = line.endswith(b"\n") and 0 < size <= self.count - filled
@@ -101,11 +105,9 @@ class RowFile:
     def append(self, block):
         """Add a block (b, row_bytes) uint8 of the next rows."""
         content = block.tobytes()
-        with _writing(self._file.name):
-            self._file.write(content)
-            self._file.flush()
-            self._journal.write(b"%d %d\n" % (len(block), zlib.crc32(content)))
-            self._journal.flush()
+        with _typed(self._file.name):
+            _write_all(self._file, content)
+            _write_all(self._journal, b"%d %d\n" % (len(block), zlib.crc32(content)))
         self.filled += len(block)
 
     @property
@@ -126,8 +128,17 @@ class RowFile:
         return span.reshape(last - first, self.row_bytes)[picked]
 
     def _read(self, first, last):
-        # At a place of its own in every call: threads share the file.
-        return os.pread(self._file.fileno(), (last - first) * self.row_bytes, first * self.row_bytes)
+        """Bytes of rows first…last, or fewer where the file ends."""
+        start, wanted = first * self.row_bytes, (last - first) * self.row_bytes
+        parts = []
+        while wanted > 0:
+            # At a place of its own in every call: threads share the file. The system may give less than it is asked for.
+            part = os.pread(self._file.fileno(), wanted, start)
+            if not part:
+                break
+            parts.append(part)
+            start, wanted = start + len(part), wanted - len(part)
+        return parts[0] if len(parts) == 1 else b"".join(parts)
 
     def close(self):
         """Close the files; the rows stay."""
@@ -139,11 +150,11 @@ class RowFile:
 def temporary():
     """A workspace that lasts as long as the block."""
     with tempfile.TemporaryDirectory(prefix="mi_prt-") as folder:
-        yield Workspace(Path(folder))
+        yield Workspace(Path(folder), lasting=False)
 
 
 @contextmanager
-def durable(output, run, resume):
+def durable(output, run, resume, open_keys=()):
     """The workspace of an output file. It stays when the block fails or the process dies, and is deleted when the block ends.
 
     Parameters
@@ -154,73 +165,114 @@ def durable(output, run, resume):
         What results depend on: scene, settings, versions. A workspace of another run is refused.
     resume : bool
         Whether to continue what is there; if there is nothing, the run starts.
+    open_keys : sequence of str
+        Keys of `run` that an unfinished run may have left open (see `Workspace.record`): they may be chosen anew.
 
     Raises
     ------
     SettingsError
-        If there is an unfinished run and `resume` is not set, or it was another run, or another process works on it.
+        If there is an unfinished run and `resume` is not set, or it was another run, or another process works on it; or if the
+        folder holds anything that is not ours.
     """
     output = Path(output)
     check_writable(output)
     folder = output.with_name(output.name + SUFFIX)
+    with _typed(folder):
+        lock = _lock(folder)
     try:
-        folder.mkdir(exist_ok=True)
-    except OSError as error:
-        raise SettingsError(f"'{folder}', for what a run can continue from, cannot be made: {error.strerror}") from None
-    with _locked(folder):
-        unfinished = _recorded(folder)
-        if unfinished is None:
-            for leftover in folder.iterdir():
-                leftover.unlink()
-        elif not resume:
-            raise SettingsError(f"'{folder}' holds an unfinished run: continue it with resume (--resume), or delete the folder")
-        else:
-            _check_same(folder, unfinished, run)
-        workspace = Workspace(folder)
-        workspace.record(run)
+        workspace = Workspace(folder, lasting=True)
+        with _typed(folder):
+            _begin(workspace, run, resume, open_keys)
         yield workspace
         workspace.remove()
-
-
-@contextmanager
-def _locked(folder):
-    """The kernel's own lock: it ends with the process, however that ends."""
-    handle = None
-    try:
-        handle = os.open(folder, os.O_RDONLY)
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except (BlockingIOError, FileNotFoundError):
-        if handle is not None:
-            os.close(handle)
-        raise SettingsError(f"another process is at work in '{folder}': wait for it, or choose another output") from None
-    try:
-        yield
     finally:
-        os.close(handle)
+        os.close(lock)
+
+
+def _lock(folder):
+    """The kernel's own lock on a folder, made if need be, as a file handle: it ends with the process, however that ends."""
+    while True:
+        folder.mkdir(exist_ok=True)
+        if folder.is_symlink():
+            raise SettingsError(f"'{folder}', for what a run can continue from, is a link: delete it")
+        try:
+            handle = os.open(folder, os.O_RDONLY)
+        except FileNotFoundError:  # another process ended and removed it just now
+            continue
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(handle)
+            raise SettingsError(f"another process is at work in '{folder}': wait for it, or choose another output") from None
+        if folder.exists() and os.path.samestat(os.fstat(handle), os.stat(folder)):
+            return handle
+        os.close(handle)  # of a folder that another process has removed: what has that name by now is another one
+
+
+def _begin(workspace, run, resume, open_keys):
+    """Find what is there to continue, and record the run."""
+    unfinished = _recorded(workspace.folder)
+    if unfinished is None:
+        for leftover in workspace.folder.iterdir():
+            leftover.unlink()
+    elif not resume:
+        raise SettingsError(
+            f"'{workspace.folder}' holds an unfinished run: continue it with resume (--resume), or delete the folder"
+        )
+    else:
+        _check_same(workspace.folder, unfinished, run, open_keys)
+    workspace.record(run)
 
 
 def _recorded(folder):
-    """What was recorded of the run in a folder, None if nothing was."""
-    try:
-        return json.loads((folder / _RUN).read_bytes())
-    except (FileNotFoundError, ValueError):
+    """What was recorded of the run in a folder, None if it holds no run."""
+    names = [path.name for path in folder.iterdir()]
+    foreign = [name for name in names if name != _RUN and not name.endswith(_OURS)]
+    if foreign:
+        raise SettingsError(f"'{folder}', for what a run can continue from, holds other files ('{foreign[0]}'): move them away")
+    if _RUN not in names:
         return None
+    try:
+        run = json.loads((folder / _RUN).read_bytes())
+        if isinstance(run, dict):
+            return run
+    except ValueError:
+        pass
+    raise SettingsError(f"'{folder / _RUN}' is damaged, so what it belongs to cannot be told: delete the folder to start anew")
 
 
-def _check_same(folder, unfinished, run):
+def _check_same(folder, unfinished, run, open_keys):
     run = json.loads(json.dumps(run))
-    # What the unfinished run left open (see `precompute`) may be chosen now.
-    changed = [f"{key} was {unfinished[key]}, now {run.get(key)}" for key in sorted(unfinished) if unfinished[key] != run.get(key)]
+    left_open = set(open_keys) - set(unfinished)
+    changed = [
+        f"{key} was {unfinished.get(key, 'not recorded')}, now {run.get(key, 'not set')}"
+        for key in sorted((set(unfinished) | set(run)) - left_open)
+        if key not in unfinished or unfinished[key] != run.get(key)
+    ]
     if changed:
         raise SettingsError(
             f"the unfinished run in '{folder}' cannot be continued: {'; '.join(changed)}; restore that, or delete the folder"
         )
 
 
+def _stored(path):
+    """The array in a file, None if it is not there or damaged."""
+    try:
+        content = path.read_bytes()
+    except FileNotFoundError:
+        return None
+    array, checksum = content[:-_CHECKSUM_BYTES], content[-_CHECKSUM_BYTES:]
+    return np.load(io.BytesIO(array)) if array and _checksum(array) == checksum else None
+
+
+def _checksum(content):
+    return zlib.crc32(content).to_bytes(_CHECKSUM_BYTES, "little")
+
+
 def _write_whole(path, content):
     """Write a file so that it is there whole or not at all."""
     temporary_path = path.with_suffix(".new")
-    with _writing(path):
+    with _typed(path):
         with open(temporary_path, "wb") as file:
             file.write(content)
             file.flush()
@@ -228,9 +280,17 @@ def _write_whole(path, content):
         os.replace(temporary_path, path)
 
 
+def _write_all(file, content):
+    """Write to a file without a buffer: what fails, fails here and not when the file is closed."""
+    left = memoryview(content)
+    while len(left):
+        left = left[file.write(left) :]
+
+
 @contextmanager
-def _writing(path):
+def _typed(path):
+    """Within the block an OSError becomes a SettingsError that names the path."""
     try:
         yield
     except OSError as error:
-        raise SettingsError(f"'{path}' cannot be written ({error.strerror}): what was computed before is kept") from None
+        raise SettingsError(f"'{path}', for what a run can continue from, cannot be used: {error.strerror or error}") from None

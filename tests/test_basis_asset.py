@@ -92,15 +92,16 @@ ITERATED = [(2400, 900, 40), (900, 1800, 40), (3000, 800, None)]
 
 
 @pytest.mark.parametrize(("n", "s", "rank"), EXACT + ITERATED)
-def test_components_are_those_of_the_svd(n, s, rank):
+def test_components_are_those_of_the_svd(n, s, rank, monkeypatch):
     """The decomposition is unique: exact for small shapes; iterated, captured variance is within 1e-3 of the optimum.
 
-    Small shapes are exact; where there is no room for a Gram matrix, they are iterated.
+    Small shapes are exact, where that is negligible; else the way that costs less is taken.
     """
     components = 16
     exact = (n, s, rank) in EXACT
     matrix, weights = random_matrix(n, s, rank), np.random.default_rng(1).random(s) + 0.2
-    basis = fit(matrix, weights, components, **({} if exact else dict(max_bytes=6e6)))
+    monkeypatch.setattr(pca, "NEGLIGIBLE", 1 if exact else 0)
+    basis = fit(matrix, weights, components)
     weighted, squares, vectors = svd(matrix, weights)
     optimum = squares[:components] / squares.sum()
     assert basis.vectors.shape == (components, s)
@@ -129,14 +130,15 @@ def test_encode_and_reconstruct_are_the_projection():
     assert relative_l2(basis.reconstruct(coefficients), projection) < 1e-5
 
 
-def test_a_fit_that_has_no_room_is_refused():
-    """Neither for a Gram matrix nor for the iteration; with what is needed and what is left."""
+def test_a_fit_that_has_no_room_is_refused(monkeypatch):
+    """With what is needed and what is left; also when a search for a share of the variance goes on."""
     matrix, weights = random_matrix(2400, 900), np.ones(900)
     with pytest.raises(SettingsError, match="max_memory") as caught:
         fit(matrix, weights, 16, max_bytes=1e6)
     assert "\n" not in str(caught.value)
-    with pytest.raises(SettingsError, match="max_memory"):  # the search for a share of the variance goes no further than it may
-        fitted(matrix, weights, variance=0.9999, max_bytes=6e6)
+    monkeypatch.setattr(pca, "NEGLIGIBLE", 0)
+    with pytest.raises(SettingsError, match="128 components"):
+        fitted(matrix, weights, variance=0.9999, max_bytes=8e6)
 
 
 @pytest.mark.parametrize("every", [2, 4])

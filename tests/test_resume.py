@@ -1,5 +1,6 @@
 """Interrupted runs: what was computed is kept, nothing half-written opens, and a continued run gives the same file."""
 
+import fcntl
 import json
 import os
 import signal
@@ -11,9 +12,12 @@ import numpy as np
 import pytest
 
 import mi_prt
+import mi_prt.runtime
 from conftest import cube, diffuse, disk, rectangle, scene
 from mi_prt import AssetError, SettingsError
 from mi_prt.basis import pca
+from mi_prt.memory import resident_bytes
+from mi_prt.runtime import thread_count as mitsuba_threads
 from mi_prt.workspace import RowFile, durable, temporary
 
 SCENE = scene(
@@ -217,6 +221,108 @@ def test_what_stands_in_the_way(tmp_path):
         assert workspace.rows("visibility", 2, 3).filled == 0
 
 
+@pytest.mark.parametrize("content", ["", "3", "[1]", "{no json", "null"])
+def test_a_damaged_record_is_refused_and_nothing_deleted(unfinished, content):
+    """What rows belong to cannot be told any more; without versions or scene it could be any run's."""
+    (partial(unfinished) / "run.json").write_text(content)
+    with pytest.raises(SettingsError, match="damaged"):
+        mi_prt.precompute(SCENE, output=unfinished, resume=True, **SETTINGS)
+    (partial(unfinished) / "run.json").write_text("{}")
+    with pytest.raises(SettingsError, match="scene was not recorded"):
+        mi_prt.precompute(SCENE, output=unfinished, resume=True, **SETTINGS)
+    assert (partial(unfinished) / "visibility.rows").stat().st_size > 0
+
+
+@pytest.mark.parametrize("foreign", ["thesis.tex", "folder"])
+def test_files_that_are_not_ours_are_left_alone(tmp_path, foreign):
+    folder = tmp_path / "a.prt.partial"
+    folder.mkdir()
+    (folder / foreign).mkdir() if foreign == "folder" else (folder / foreign).write_text("precious")
+    with pytest.raises(SettingsError, match=foreign):
+        mi_prt.precompute(SCENE, output=tmp_path / "a.prt", **SETTINGS)
+    assert os.listdir(folder) == [foreign]
+
+
+def test_a_link_in_the_place_of_the_folder_is_refused(tmp_path):
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "a.prt.partial").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(SettingsError, match="link"):
+        mi_prt.precompute(SCENE, output=tmp_path / "a.prt", **SETTINGS)
+
+
+def test_a_folder_that_was_replaced_while_it_was_locked(tmp_path, monkeypatch):
+    """The first lock is on a folder that another process removes and makes again: it is noticed, and the new one is locked."""
+    flock, calls = fcntl.flock, []
+
+    def replaced(handle, operation):
+        if not calls:
+            (tmp_path / "a.prt.partial").rmdir()
+            (tmp_path / "a.prt.partial").mkdir()
+        calls.append(handle)
+        flock(handle, operation)
+
+    monkeypatch.setattr(fcntl, "flock", replaced)
+    with durable(tmp_path / "a.prt", {}, False):
+        monkeypatch.setattr(fcntl, "flock", flock)
+        with pytest.raises(SettingsError, match="another process"):
+            with durable(tmp_path / "a.prt", {}, True):
+                pass
+    assert len(calls) == 2
+
+
+def test_the_scene_is_not_overwritten(tmp_path):
+    path = tmp_path / "scene.xml"
+    path.write_text("<scene version='3.0.0'><shape type='sphere'/></scene>")
+    with pytest.raises(SettingsError, match="the scene itself"):
+        mi_prt.precompute(path, output=path)
+    assert "sphere" in path.read_text() and os.listdir(tmp_path) == ["scene.xml"]
+
+
+def test_a_link_to_the_output_stays_a_link(undisturbed, tmp_path):
+    (tmp_path / "data").mkdir()
+    (tmp_path / "a.prt").symlink_to(tmp_path / "data" / "a.prt")
+    mi_prt.precompute(SCENE, output=tmp_path / "a.prt", **SETTINGS)
+    assert (tmp_path / "a.prt").is_symlink() and (tmp_path / "data" / "a.prt").read_bytes() == undisturbed.read_bytes()
+
+
+def test_resume_needs_an_output():
+    with pytest.raises(SettingsError, match="output"):
+        mi_prt.precompute(SCENE, resume=True, **SETTINGS)
+
+
+def test_numbers_of_other_types_are_the_same_settings(unfinished, undisturbed):
+    """The command line passes text, programs NumPy's numbers."""
+    settings = dict(directions="cubemap:16", edge_length="0.10", coefficients=np.int64(24), seed=np.int32(0))
+    mi_prt.precompute(SCENE, output=unfinished, resume=True, rays_per_direction=np.int16(1), **settings)
+    assert unfinished.read_bytes() == undisturbed.read_bytes()
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+@pytest.mark.parametrize("negligible", [0, 1e9], ids=["iterated", "exact"])
+def test_results_do_not_depend_on_threads_and_memory(tmp_path, monkeypatch, threads, negligible):
+    """The way of the fit is chosen by shape alone, and sums are taken in an order that is fixed."""
+    monkeypatch.setattr(pca, "NEGLIGIBLE", negligible)
+    mi_prt.precompute(SCENE, output=tmp_path / "a.prt", **SETTINGS)
+    before = mitsuba_threads()
+    mi_prt.runtime.set_threads(threads)
+    try:
+        limit = resident_bytes() + 200_000_000
+        mi_prt.precompute(SCENE, output=tmp_path / "b.prt", max_memory=limit, **SETTINGS)
+    finally:
+        mi_prt.runtime.set_threads(before)
+    assert (tmp_path / "a.prt").read_bytes() == (tmp_path / "b.prt").read_bytes()
+
+
+def test_a_share_that_is_out_of_reach_costs_no_rays(tmp_path):
+    """Harmonics do not get there: another share may be asked for, and the rays are not traced again."""
+    settings = dict(directions="cubemap:8", edge_length=0.3, basis="sh", coefficients="auto")
+    path, seen = tmp_path / "a.prt", []
+    with pytest.raises(SettingsError, match="resume"):
+        mi_prt.precompute(SCENE, output=path, variance=0.99999, **settings)
+    mi_prt.precompute(SCENE, output=path, variance=0.8, resume=True, progress=lambda *event: seen.append(event), **settings)
+    assert seen[0][:3] == ("transport", seen[0][2], seen[0][2])
+
+
 def test_an_unfinished_run_is_no_asset(unfinished):
     for path in [unfinished, partial(unfinished), partial(unfinished) / "visibility.rows"]:
         with pytest.raises(AssetError):
@@ -273,14 +379,28 @@ def test_a_damaged_block_and_a_torn_journal_are_dropped(rows):
 
 
 def test_arrays_are_kept_whole_or_not_at_all():
+    """Torn, with one bit flipped, or with another file's content: computed again, and stored."""
     with temporary() as workspace:
+        path = workspace.folder / "a.array"
         assert workspace.keep("a", lambda: np.arange(3.0)).sum() == 3
         assert workspace.keep("a", lambda: np.zeros(3)).sum() == 3
-        (workspace.folder / "a.npy").write_bytes(b"torn")
-        assert workspace.keep("a", lambda: np.ones(3)).sum() == 3
-        assert sorted(p.name for p in workspace.folder.iterdir()) == ["a.npy"]
+        whole = path.read_bytes()
+        for damaged in [b"", b"torn", whole[:-5], whole[:130] + bytes([whole[130] ^ 1]) + whole[131:], b"PK" + whole[2:], whole * 2]:
+            path.write_bytes(damaged)
+            assert workspace.keep("a", lambda: np.full(3, 5.0)).sum() == 15
+        assert [p.name for p in workspace.folder.iterdir()] == ["a.array"]
         folder = workspace.folder
     assert not folder.exists()
+
+
+def test_reads_beyond_what_the_system_gives_at_once(rows, monkeypatch):
+    """Linux reads at most 2 GiB in one call; here three bytes."""
+    path, matrix = rows
+    pread = os.pread
+    monkeypatch.setattr(os, "pread", lambda handle, size, start: pread(handle, min(size, 3), start))
+    file = RowFile(path, 10, 5)
+    assert file.filled == 10
+    np.testing.assert_array_equal(file[:], matrix)
 
 
 # --- memory --------------------------------------------------------------------------------------------------------

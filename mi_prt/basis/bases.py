@@ -3,6 +3,7 @@
 from math import inf
 
 from ..errors import SettingsError
+from . import haar, harmonics, pca
 from .haar import HaarBasis, SharedHaarBasis, check_haar, fit_haar, fit_haar_shared
 from .harmonics import HarmonicBasis, check_harmonics, fit_harmonics, most_harmonics
 from .none import NoBasis
@@ -74,3 +75,18 @@ def default_components(kind, directions, points):
 def most_components(kind, directions, points):
     """The largest number of components that there can be."""
     return min(points - 1, len(directions)) if kind == "pca" else len(directions)
+
+
+def fit_bytes(kind, points, directions, components):
+    """Memory that fitting a basis of so many components takes, its functions included."""
+    if kind == "pca":
+        return pca.fit_bytes(points, directions, components)
+    return {"sh": harmonics.FIT_BYTES, "haar-shared": haar.FIT_BYTES}.get(kind, 0) * components * directions
+
+
+def coefficient_bytes(kind, points, directions, components, rays_per_direction=1):
+    """Bytes of the coefficients of all points, as they are stored."""
+    if kind == "none":
+        return points * -(-directions * rays_per_direction // 16)
+    index = (2 if directions <= 1 << 16 else 4) if kind == "haar" else 0
+    return points * components * (4 + index)

@@ -23,6 +23,8 @@ from .linear import LinearBasis
 from .rows import Rows
 from .target import Fit, Target, centred, check_room, fit_of, shares
 
+FIT_BYTES = 12  # for each wavelet of a shared set and direction: as a function, weighted, and to encode with
+
 
 @dataclass(frozen=True, eq=False)
 class HaarBasis(Basis):
@@ -63,7 +65,7 @@ class HaarBasis(Basis):
         largest = np.argpartition(-np.abs(coefficients), len(self) - 1, axis=1)[:, : len(self)]
         largest.sort(axis=1)
         entries = np.take_along_axis(coefficients, largest, axis=1)
-        ends = np.arange(count + 1) * len(self)
+        ends = row_ends(count, len(self))
         return scipy.sparse.csr_array((entries.ravel(), largest.ravel().astype(np.int32), ends), shape=(count, s))
 
     def reconstruct(self, coefficients):
@@ -200,6 +202,11 @@ class HaarTransform:
 haar_transform = cache(HaarTransform)
 
 
+def row_ends(rows, entries):
+    """Where the rows of a sparse array end that have so many entries each; of 32 bits, as SciPy then keeps the indices too."""
+    return np.arange(rows + 1, dtype=np.int32 if rows * entries < 1 << 31 else np.int64) * entries
+
+
 def _pairs(faces):
     """Views of the first and the second of neighbouring columns, and of neighbouring rows."""
     return (faces[:, :, 0::2], faces[:, :, 1::2]), (faces[:, 0::2], faces[:, 1::2])
@@ -290,7 +297,7 @@ def fit_haar_shared(rows: Rows, target: Target, seed=0, progress=lambda done, to
     variance = centred(energy, total, n)
     order = np.argsort(-energies, kind="stable")
     components, residual = _fewest(target, energies[order], variance)
-    check_room(f"a basis of {components:,} wavelets", 16 * components * s, max_bytes)
+    check_room(f"a basis of {components:,} wavelets", FIT_BYTES * components * s, max_bytes)
     chosen = order[:components]
     vectors = np.zeros((components, s), np.float32)
     vectors[np.arange(components), chosen] = 1

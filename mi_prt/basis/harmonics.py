@@ -16,6 +16,7 @@ from .target import Fit, Target, centred, check_room, fit_of, shares
 
 MAX_BANDS = 33  # 1,089 functions: far beyond what low-frequency light needs, and cheap to turn still
 FIRST_BANDS = 10  # where a search for a share of the variance starts
+FIT_BYTES = 32  # for each function and direction: in float64, made orthonormal, and in float32
 LEAST_EIGENVALUE = 0.25  # of the functions' Gram matrix over a lattice's directions; 1 on the sphere
 
 
@@ -242,7 +243,7 @@ def fit_harmonics(rows: Rows, target: Target, seed=0, progress=lambda done, tota
         many bands do not capture the share of the variance, or need more than `max_bytes`.
     """
     largest = MAX_BANDS**2 if target.components is None else target.components
-    check_room(f"a basis of {largest:,} spherical harmonics", 32 * largest * rows.shape[1], max_bytes)
+    check_room(f"a basis of {largest:,} spherical harmonics", FIT_BYTES * largest * rows.shape[1], max_bytes)
     functions, gram = _functions(rows.directions, target.components)
     most = isqrt(len(functions))
     bands = most if target.variance is None else min(FIRST_BANDS, most)

@@ -33,7 +33,8 @@ ITERATION_COST, ROW_COST, GRAM_COST, DECOMPOSITION_COST = 1.3e-10, 4e-9, 2e-11, 
 GRAM_BYTES = 40  # for each entry of a Gram matrix: the sum, parts of it that some threads have ready, the decomposition
 GRAM_ROWS = 1024  # rows of one product: fewer would pass over the Gram matrix too often
 NEGLIGIBLE = 0.5  # seconds that exactness is worth
-ITERATION_BYTES = 72  # for each direction and column of the subspace: sums of some threads in float64, and the orthonormalization
+MOST_GRAM_BYTES = 1 << 29  # a larger Gram matrix is no choice, only where there is no other
+ITERATION_BYTES = 96  # for each direction and column of the subspace: sums of some threads in float64, and the orthonormalization
 
 
 class PCA(LinearBasis):
@@ -63,7 +64,7 @@ def fit_pca(rows, target, seed=0, progress=lambda done, total: None, max_bytes=n
     progress : callable(done, total)
         Called after every pass over the rows.
     max_bytes : float
-        Memory that the fit may take. Where a Gram matrix does not fit into it, the iteration is used whatever it costs.
+        Memory that the fit may take.
     keep : callable(name, compute) returning an array
         Called for what each pass over the rows gives, so that a caller may store and restore it; `name` tells the pass.
 
@@ -75,15 +76,16 @@ def fit_pca(rows, target, seed=0, progress=lambda done, total: None, max_bytes=n
     Raises
     ------
     SettingsError
-        If neither way fits into `max_bytes`.
+        If it does not fit into `max_bytes`.
     """
     mean, squares = _unpacked(keep("moments", lambda: np.append(*rows.moments())))
     n, s = rows.shape
     variance = max(squares - n * float(mean @ mean), 0.0)
     largest = min(n - 1, s)
     components = target.components if target.variance is None else min(FIRST_COMPONENTS, largest)
+    vectors = np.zeros((s, 0), np.float32)
     while True:
-        values, vectors = _leading(rows, mean, components, seed, progress, keep, max_bytes)
+        values, vectors = _leading(rows, mean, components, vectors, seed, progress, keep, max_bytes)
         # Rows are float32: what is below their rounding carries nothing.
         values = values[values > RANK_TOLERANCE * squares]
         enough = target.variance is None or values.sum() >= target.variance * variance
@@ -105,32 +107,51 @@ def _unpacked(moments):
     return moments[:-1], float(moments[-1])
 
 
-def _leading(rows, mean, components, seed, progress, keep, max_bytes):
-    """Leading squared singular values, descending, and right singular vectors (s, components) of the centred, weighted rows."""
-    subspace = components + max(OVERSAMPLING, components // 4)
-    n, s = rows.shape
+def fit_bytes(n, s, components):
+    """Memory that fitting so many components to a matrix (n, s) takes."""
+    return _plan(n, s, components)[1]
+
+
+def _plan(n, s, components):
+    """Whether the Gram matrix is used, and the bytes that the way chosen takes.
+
+    It does not depend on how much memory there is: the same run gives the same result anywhere.
+    """
+    subspace = _subspace(components)
     side = min(n, s)
     gram_bytes = GRAM_BYTES * side**2 + (16 * n * s if n < s else 0)
     iteration_bytes = ITERATION_BYTES * s * subspace
     iteration = n * s * (subspace * ITERATION_COST + ROW_COST)
     gram = n * s * side * GRAM_COST + side**3 * DECOMPOSITION_COST
-    fits = gram_bytes <= max_bytes
     # Subspaces that together reach a large part of the space are no smaller problem than the whole.
-    if 2 * subspace > side or (fits and (gram <= max(iteration, NEGLIGIBLE) or iteration_bytes > max_bytes)):
-        check_room(f"a Gram matrix for {components:,} components", gram_bytes, max_bytes)
+    exact = 2 * subspace > side or (gram_bytes <= MOST_GRAM_BYTES and gram <= max(iteration, NEGLIGIBLE))
+    return exact, gram_bytes if exact else iteration_bytes
+
+
+def _subspace(components):
+    return components + max(OVERSAMPLING, components // 4)
+
+
+def _leading(rows, mean, components, start, seed, progress, keep, max_bytes):
+    """Leading squared singular values, descending, and right singular vectors (s, components) of the centred, weighted rows."""
+    exact, needed = _plan(*rows.shape, components)
+    check_room(f"fitting {components:,} components", needed, max_bytes)
+    if exact:
         return _exact(rows, mean, components, progress)
-    check_room(f"fitting {components:,} components", iteration_bytes, max_bytes)
-    return _subspace_iteration(rows, mean, components, subspace, seed, progress, keep)
+    return _subspace_iteration(rows, mean, components, start, seed, progress, keep)
 
 
-def _subspace_iteration(rows, mean, components, subspace, seed, progress, keep):
+def _subspace_iteration(rows, mean, components, start, seed, progress, keep):
+    """`start` (s, k) are vectors of an earlier fit with fewer components: what they span need not be found again."""
+    subspace = _subspace(components)
     random = np.random.default_rng(seed)
     basis = random.standard_normal((len(mean), subspace)).astype(np.float32)
+    basis[:, : start.shape[1]] = start
     sample = rows.index
     if len(sample) > 40 * subspace:
         # At random, not every fourth: the order of points may repeat.
         sample = np.sort(random.choice(sample, len(sample) // 4, replace=False))
-    passes = [sample] * SAMPLE_ITERATIONS + [rows.index] * ITERATIONS
+    passes = [sample] * (0 if start.shape[1] else SAMPLE_ITERATIONS) + [rows.index] * ITERATIONS
     for done, part in enumerate(passes, start=1):
         before = basis
         basis = keep(f"subspace-{subspace}-{done}", lambda: _iterated(rows, part, mean, before))

@@ -69,7 +69,7 @@ class Surface:
         if self.kind == "mesh":
             return ""
         if "to_world" not in mitsuba().traverse(self.shape):
-            return f"{self.kind} {self.shape.bbox()}"
+            return f"{self.kind} {self.shape.bbox()} {_digest_of_parameters(self.shape)}"
         place = self.to_world @ transform_of(self.shape)
         flipped = " flipped" if self.shape.has_flipped_normals() else ""
         return self.kind + flipped + " " + " ".join(f"{x:.6g}" for x in place[:3].ravel() + 0.0)
@@ -330,3 +330,12 @@ def _darken(emitter):
         if key.split(".")[0] in ("radiance", "intensity", "irradiance", "sampling_weight") and "to_uv" not in key:
             parameters[key] = parameters[key] * 0
     parameters.update()
+
+
+def _digest_of_parameters(shape):
+    """SHA-256 of the numbers that a shape is made of: control points of curves and the like."""
+    digest = hashlib.sha256()
+    parameters = mitsuba().traverse(shape)
+    for key in sorted(key for key in parameters.keys() if "." not in key):  # not those of its material
+        digest.update(key.encode() + np.ascontiguousarray(np.array(parameters[key])).tobytes())
+    return digest.hexdigest()

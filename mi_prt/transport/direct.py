@@ -80,7 +80,12 @@ class DirectTransport:
 
     def in_memory(self):
         """The same with all bits in memory."""
-        return replace(self, bits=np.array(self.bits[:]))
+        bits = np.empty(self.bits.shape, np.uint8)
+        step = 1 << 14
+        for first in range(0, len(bits), step):
+            block = slice(first, first + step)
+            bits[block] = self.bits[block]
+        return replace(self, bits=bits)
 
     def dark(self):
         """Which points (n,) see no direction at all."""
@@ -202,7 +207,7 @@ class VisibilityTracer:
         return np.packbits(np.array(visible).reshape(-1, self.lanes_per_point), axis=1)
 
 
-def find_buried(scene, points, dark):
+def find_buried(scene, points, dark, lanes=LANES):
     """Which points without any sky lie inside or against other geometry.
 
     A point is buried when every ray of its hemisphere ends on the back of a face or nearer than 1e-3 of the scene's
@@ -214,6 +219,8 @@ def find_buried(scene, points, dark):
     points : Points
     dark : (n,) bool
         Points that see no direction of the sky.
+    lanes : int
+        Most rays of one wavefront.
 
     Returns
     -------
@@ -230,7 +237,7 @@ def find_buried(scene, points, dark):
     z = 1 - (np.arange(BURIED_RAYS) + 0.5) * 2 / BURIED_RAYS
     phi = np.arange(BURIED_RAYS) * np.pi * (3 - 5**0.5)
     vectors = np.stack([np.sqrt(1 - z * z) * np.cos(phi), np.sqrt(1 - z * z) * np.sin(phi), z], axis=-1).astype(np.float32)
-    step = LANES // BURIED_RAYS
+    step = max(1, lanes // BURIED_RAYS)
     for chunk in np.split(index, range(step, len(index), step)):
         normals = np.repeat(points.normals[chunk], BURIED_RAYS, axis=0)
         toward = np.tile(vectors, (len(chunk), 1))
