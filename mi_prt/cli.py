@@ -25,6 +25,8 @@ app = typer.Typer(
     "mi-prt relight teapot.prt -o teapot.png --rotate y:45",
 )
 
+LOG_SECONDS = 20  # between lines of progress where there is no terminal
+
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else.")]
 Threads = Annotated[Optional[int], typer.Option("--threads", metavar="N", help="CPU threads; default: all cores.")]
 Define = Annotated[
@@ -152,7 +154,7 @@ def precompute(
     check_writable(output)
     _set_threads(threads)
     started = time.perf_counter()
-    with _progress() as progress:
+    with _progress(kept=f"{output}.partial") as progress:
         asset, cost = measure(
             scene,
             _parameters(define),
@@ -256,7 +258,7 @@ def compare(
 
 
 def main(arguments=None):
-    """Run the program; exit codes: 0 done, 2 bad usage or input, 1 anything else."""
+    """Run the program; exit codes: 0 done, 2 bad usage or input, 130 interrupted, 1 anything else."""
     warnings.showwarning = lambda message, *_, **__: _note(str(message))
     try:
         from .runtime import quiet_mitsuba
@@ -267,9 +269,6 @@ def main(arguments=None):
     except PrtError as error:
         print(f"mi-prt: {error}", file=sys.stderr)
         sys.exit(error.exit_code)
-    except KeyboardInterrupt:
-        print("mi-prt: interrupted; nothing was left half-written, and --resume continues a precomputation", file=sys.stderr)
-        sys.exit(1)
     except MemoryError:
         print("mi-prt: out of memory: use fewer --directions or a longer --edge-length, or set --max-memory", file=sys.stderr)
         sys.exit(1)
@@ -381,8 +380,11 @@ def _plain(entry):
 
 
 @contextmanager
-def _progress():
-    """A callable(stage, done, total) that draws progress with ETA on stderr."""
+def _progress(kept=None):
+    """A callable(stage, done, total, detail) that draws progress with ETA on stderr, and where that is no terminal, prints it.
+
+    Ctrl-C ends the program within the block, with a word on what was kept.
+    """
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -394,11 +396,22 @@ def _progress():
         TextColumn("{task.fields[detail]}"),
     )
     tasks = {}
-    with Progress(*columns, console=Console(stderr=True)) as bar:
+    console = Console(stderr=True)
+    printed = time.monotonic()
+    with Progress(*columns, console=console) as bar:
 
         def progress(stage, done, total, detail=""):
+            nonlocal printed
             if stage not in tasks:
                 tasks[stage] = bar.add_task(stage, total=total, detail="")
             bar.update(tasks[stage], completed=done, total=total, detail=detail)
+            if not console.is_terminal and time.monotonic() > printed + LOG_SECONDS:
+                printed = time.monotonic()
+                _note(f"{stage} {done}/{total} {detail}".rstrip())
 
-        yield progress
+        try:
+            yield progress
+        except KeyboardInterrupt:
+            bar.stop()
+            _note("interrupted; nothing is left half-written" + (f", and --resume continues ({kept})" if kept else ""))
+            sys.exit(130)

@@ -8,18 +8,19 @@ import numpy as np
 from .asset_file import coefficient_arrays
 from .basis.bases import coefficient_bytes, fit_bytes
 from .directions import parse_directions
-from .parallel import BLOCK_ROWS
+from .memory import resident_bytes
+from .parallel import BLOCK_ROWS, map_chunks
 from .points.points import POINT_BUDGET, sample_points
 from .precompute import LANE_BYTES, POINT_BYTES, Settings
 from .provenance import left_out
-from .runtime import peak_memory_bytes
 from .scene.scene import open_scene
 from .transport.direct import LANES, sample_direct
 
 PROBE_POINTS = 256
+PROBE_BLOCKS = 32
 AUTO_COEFFICIENTS = 64  # what `auto` is predicted with: how many it takes is known once it is fitted
-# Work of fitting and encoding, in passes over all rows that multiply them with a basis of that many components, and back.
-BASIS_PASSES = {"pca": 5.5, "sh": 1.5, "haar": 4.0, "haar-shared": 3.0, "none": 0.0}
+# Work of fitting and encoding: how often all rows are expanded (and transformed), and multiplied with as many vectors as components.
+BASIS_WORK = {"pca": (3, 20), "sh": (1, 2), "haar": (3, 0), "haar-shared": (2, 1), "none": (0, 0)}
 
 
 def describe(source, parameters=None, **settings):
@@ -46,23 +47,25 @@ def describe(source, parameters=None, **settings):
     started = time.perf_counter()
     points = sample_points(scene, settings.edge_length)
     sampling = time.perf_counter() - started
+    held = resident_bytes()
     directions = parse_directions(settings.directions)
     target = settings.target(len(points))
     coefficients = AUTO_COEFFICIENTS if target.components is None else target.components
     probe = _probe(scene, points, directions, settings, coefficients)
     n, s, rays = len(points), len(directions), settings.rays_per_direction
     transport = probe["rays"] * n / probe["rate"]
-    basis = probe["pass"] * n * BASIS_PASSES[settings.basis]
+    expanded, multiplied = BASIS_WORK[settings.basis]
+    basis = n * (expanded * probe["expanding"] + multiplied * probe["multiplying"])
     relighting, projection = storage_bytes(settings.basis, n, s, coefficients, rays)
     stored = relighting + projection + n * 77 + s * 24 + 4 * len(points.patches.nodes)
-    working = LANES * LANE_BYTES + 72 * s * (coefficients + 16) + 2 * stored
+    working = LANES * LANE_BYTES // 2 + POINT_BYTES * n + fit_bytes(settings.basis, n, s, coefficients) + 2 * relighting
     return {
         "requires": _requirements(scene, points, int(probe["rays"] * n)),
         "settings": _reasons(settings, points, directions, coefficients),
         "left_out": left_out(scene),
         "predicted": {
-            "seconds": round(loading + sampling + transport + basis + 1.0, 1),
-            "peak_memory_bytes": int(peak_memory_bytes() + working),
+            "seconds": round(loading + sampling + transport + basis + 0.5, 1),
+            "peak_memory_bytes": int(held + working),
             "bytes": int(stored),
             "relighting_bytes": int(relighting),
             "projection_bytes": int(projection),
@@ -107,6 +110,8 @@ def describe_asset(asset):
         "basis": sum(getattr(asset.basis, name).nbytes for name in asset.basis.ARRAYS),
         "file": asset.path.stat().st_size if asset.path else None,
     }
+    # Without a mean the components also hold that of the transport, and their energies sum to more than the variance.
+    per_component = "captured_variance_per_component" if asset.basis.kind == "pca" else "energy_over_variance_per_component"
     return {
         "points": n,
         "directions": s,
@@ -114,7 +119,7 @@ def describe_asset(asset):
         "coefficients": d,
         "captured_variance": asset.report["captured_variance"],
         "relative_error": asset.report["relative_error"],
-        "captured_variance_per_component": [round(float(v), 6) for v in asset.basis.captured_variance],
+        per_component: [round(float(v), 6) for v in asset.basis.captured_variance],
         "storage": {"predicted": {"relighting": relighting, "projection": projection}, "measured": measured},
         "buried_points": int(asset.buried.sum()),
         "scene": asset.scene,
@@ -132,17 +137,16 @@ def _probe(scene, points, directions, settings, coefficients):
     started = time.perf_counter()
     transport = sample_direct(scene, few, directions, settings.rays_per_direction)
     rate = max(transport.rays, 1) / (time.perf_counter() - started)
-    basis = np.ones((len(directions), coefficients + 16), np.float32)
-    transport.rows(slice(0, BLOCK_ROWS)) @ basis
-    started = time.perf_counter()
-    for first in range(0, len(index), BLOCK_ROWS):
-        block = transport.rows(slice(first, first + BLOCK_ROWS))
-        block.T @ (block @ basis)
-    return {
-        "rays": transport.rays / len(index),
-        "rate": rate,
-        "pass": (time.perf_counter() - started) / len(index),
-    }
+    index = np.arange(len(few))
+    vectors = np.ones((len(directions), coefficients), np.float32)
+    rows = transport.rows(slice(0, BLOCK_ROWS))
+    seconds = {}
+    for name, run in {"expanding": lambda: transport.rows(slice(0, BLOCK_ROWS)), "multiplying": lambda: rows @ vectors}.items():
+        list(map_chunks(lambda _: run(), range(8)))  # until memory is warm
+        started = time.perf_counter()
+        list(map_chunks(lambda _: run(), range(PROBE_BLOCKS)))
+        seconds[name] = (time.perf_counter() - started) / (PROBE_BLOCKS * len(rows))
+    return {"rays": transport.rays / len(index), "rate": rate} | seconds
 
 
 def _requirements(scene, points, rays):

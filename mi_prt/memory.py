@@ -5,7 +5,14 @@ import psutil
 from .errors import SettingsError
 
 _UNITS = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
-_CONTROL_GROUP = "/sys/fs/cgroup/memory."
+# Where a control group says its limit, what it uses and what of that is cache, of version 2 and of version 1.
+_CONTROL_GROUPS = {
+    "": ("/sys/fs/cgroup{group}/", ("memory.max", "memory.current", "memory.stat", "inactive_file")),
+    "memory": (
+        "/sys/fs/cgroup/memory{group}/",
+        ("memory.limit_in_bytes", "memory.usage_in_bytes", "memory.stat", "total_inactive_file"),
+    ),
+}
 
 
 def parse_bytes(text):
@@ -35,14 +42,29 @@ def resident_bytes():
 
 
 def free_bytes():
-    """Memory that this process could still get, its container's limit included."""
+    """Memory that this process could still get, its container's limits included."""
     free = psutil.virtual_memory().available
+    for folder, names in _control_groups():
+        try:
+            limit, used, statistics = (open(folder + name).read().split() for name in names[:3])
+        except OSError:
+            continue
+        if limit != ["max"]:
+            # Pages of files that nobody has open count as used and are given back when memory is asked for.
+            cached = dict(zip(statistics[::2], statistics[1::2])).get(names[3], 0)
+            free = min(free, int(limit[0]) - int(used[0]) + int(cached))
+    return max(free, 0)
+
+
+def _control_groups():
+    """Folders of the memory control groups that this process may be in: its own, and the root as a container sees it."""
     try:
-        limit, used, statistics = (open(_CONTROL_GROUP + name).read().split() for name in ("max", "current", "stat"))
+        lines = open("/proc/self/cgroup").read().splitlines()
     except OSError:
-        return free
-    if limit == ["max"]:
-        return free
-    # Pages of files that nobody has open count as used and are given back when memory is asked for.
-    cached = dict(zip(statistics[::2], statistics[1::2])).get("inactive_file", 0)
-    return max(min(free, int(limit[0]) - int(used[0]) + int(cached)), 0)
+        return
+    for _, controllers, group in (line.split(":", 2) for line in lines):
+        for controller in controllers.split(","):
+            if controller in _CONTROL_GROUPS:
+                folder, names = _CONTROL_GROUPS[controller]
+                for place in dict.fromkeys((group.rstrip("/"), "")):
+                    yield folder.format(group=place), names

@@ -38,6 +38,7 @@ MAX_RAYS_PER_DIRECTION = 64
 LANE_BYTES = 40  # of a wavefront, for each of its rays
 POINT_BYTES = 240  # for each point, what the ray tracer and the fit hold of it beside the points themselves
 LEAST_LANES = 1 << 16
+COPIES = {"haar": 3.2}  # of the stored coefficients in memory, where blocks are put together: indices are wider there; else 2
 OPEN_KEYS = ("coefficients", "variance")  # what may be chosen anew when the fit could not give what was asked for
 
 
@@ -134,7 +135,8 @@ def _number(name, value):
     try:
         return float(value)
     except (TypeError, ValueError):
-        raise SettingsError(f"{name} must be a number, got {value!r}") from None
+        auto = "neither 'auto' nor" if name == "edge_length" else "not"
+        raise SettingsError(f"{name} {value!r} is {auto} a number") from None
 
 
 def precompute(scene, parameters=None, progress=None, output=None, resume=False, max_memory=None, **settings):
@@ -285,7 +287,7 @@ class Room:
         components = target.components or 0
         coefficients = coefficient_bytes(settings.basis, n, s, components, rays)
         blocks = BLOCK_ROWS * s * (6 * rays + 12) * thread_count()
-        fixed = POINT_BYTES * n + blocks + 2 * coefficients
+        fixed = POINT_BYTES * n + blocks + COPIES.get(settings.basis, 2) * coefficients
         needed = fixed + fit_bytes(settings.basis, n, s, components) + LANE_BYTES * LEAST_LANES
         if limit - held < needed:
             raise SettingsError(
@@ -331,7 +333,7 @@ def _compress(transport, directions, buried, settings, target, room, workspace, 
                 f"{settings.coefficients} coefficients are above the rank of the transport: at most {len(fit.basis)}"
             )
         if target.components is None:
-            size = 2 * coefficient_bytes(settings.basis, *transport.shape, len(fit.basis))
+            size = COPIES.get(settings.basis, 2) * coefficient_bytes(settings.basis, *transport.shape, len(fit.basis))
             check_room(f"keeping {len(fit.basis):,} coefficients of {n:,} points", size, room.basis)
     except SettingsError as error:
         if not workspace.lasting:

@@ -34,7 +34,7 @@ GRAM_BYTES = 40  # for each entry of a Gram matrix: the sum, parts of it that so
 GRAM_ROWS = 1024  # rows of one product: fewer would pass over the Gram matrix too often
 NEGLIGIBLE = 0.5  # seconds that exactness is worth
 MOST_GRAM_BYTES = 1 << 29  # a larger Gram matrix is no choice, only where there is no other
-ITERATION_BYTES = 96  # for each direction and column of the subspace: sums of some threads in float64, and the orthonormalization
+ITERATION_BYTES = 110  # for each direction and column of the subspace: sums of some threads in float64, and the orthonormalization
 
 
 class PCA(LinearBasis):
