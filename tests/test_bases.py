@@ -140,6 +140,18 @@ def test_unknown_bases_and_indices_beyond_the_lattice_are_refused(assets, tmp_pa
         mi_prt.load(tmp_path / "b.prt")
 
 
+@pytest.mark.parametrize("rays", [1, 3])
+def test_single_entries_of_bits_are_those_of_the_rows(rays):
+    """Read bit by bit for point lights, expanded for all else: the same numbers."""
+    asset = mi_prt.precompute(scene(**PARTS), directions="cubemap:8", edge_length=0.5, basis="none", rays_per_direction=rays)
+    cells = np.random.default_rng(0).integers(0, 384, (len(asset.points), 40))
+    expected = np.take_along_axis(asset.transport(np.arange(len(asset.points))), cells, axis=1)
+    np.testing.assert_allclose(asset.basis.at(asset.coefficients, cells), expected, atol=1e-6)
+    part = asset.coefficients[5:9]
+    np.testing.assert_allclose(asset.basis.at(part, cells[5:9]), expected[5:9], atol=1e-6)
+    assert (expected > 0).mean() > 0.1
+
+
 # --- lattices ------------------------------------------------------------------------------------------------------
 
 

@@ -9,7 +9,7 @@ from .basis import Basis
 
 @dataclass(frozen=True, eq=False)
 class NoBasis(Basis):
-    """Coefficients are the sampled transport itself.
+    """Coefficients are the sampled `DirectTransport` itself.
 
     Parameters
     ----------
@@ -32,12 +32,12 @@ class NoBasis(Basis):
         return rows
 
     def reconstruct(self, coefficients):
-        """The coefficients (b, s) themselves."""
-        return coefficients
+        """Transport rows (b, s) float32 of a `DirectTransport` of b points."""
+        return coefficients.rows(slice(None))
 
     def at(self, coefficients, cells):
-        """Transport (b, k) float32 of points with coefficients (b, s) in some cells (b, k) of the lattice each."""
-        return np.take_along_axis(coefficients, cells, axis=1)
+        """Transport (b, k) float32 of a `DirectTransport` of b points in some cells (b, k) of the lattice each."""
+        return coefficients.entries(cells)
 
     def project_light(self, radiance):
         """Light (s, 3) float32 that irradiance is the product with, and no mean response (3,)."""

@@ -26,6 +26,7 @@ SAMPLE_ITERATIONS = 2  # power iterations on a quarter of the rows, which find n
 ITERATIONS = 2  # power iterations on all rows, before the final projection
 RANK_TOLERANCE = 100 * float(np.finfo(np.float32).eps) ** 2  # of squared singular values, against the sum of squares
 FIRST_COMPONENTS = 64  # where a search for a share of the variance starts
+MARGIN = 1.1  # above what that search expects to need
 
 # Seconds on two cores, of which only the ratios matter: for each element of a row and column of the subspace, for each element
 # of a row, for each product of the Gram matrix, and for each s³ of its decomposition.
@@ -91,7 +92,7 @@ def fit_pca(rows, target, seed=0, progress=lambda done, total: None, max_bytes=n
         enough = target.variance is None or values.sum() >= target.variance * variance
         if enough or components >= largest or len(values) < components:
             break
-        components = min(2 * components, largest)
+        components = min(_more(values, variance, target.variance), largest)
     if target.variance is not None and enough:
         values = values[: 1 + int(np.searchsorted(np.cumsum(values), target.variance * variance))]
     basis = PCA(
@@ -105,6 +106,18 @@ def fit_pca(rows, target, seed=0, progress=lambda done, total: None, max_bytes=n
 
 def _unpacked(moments):
     return moments[:-1], float(moments[-1])
+
+
+def _more(values, variance, share):
+    """How many components to try next for a share of the variance, where these did not capture it.
+
+    What is left falls about as a power of their number, which the second half of them tells.
+    """
+    d = len(values)
+    left = variance - np.cumsum(values)
+    power = np.log(left[d // 2 - 1] / left[-1]) / np.log(d / (d // 2))
+    wanted = d * (left[-1] / ((1 - share) * variance)) ** (1 / max(power, 0.1))
+    return int(np.clip(MARGIN * wanted, d + OVERSAMPLING, 4 * d))
 
 
 def fit_bytes(n, s, components):

@@ -67,7 +67,18 @@ class DirectTransport:
         return rows
 
     def __getitem__(self, index):
-        return self.rows(index)
+        """The transport of some points, still as bits."""
+        return replace(self, normals=self.normals[index], bits=self.bits[index])
+
+    def entries(self, cells):
+        """Single entries (n, k) float32 of the matrix: those of each row in cells (n, k), without expanding it."""
+        rays, half, _ = self.vectors.shape
+        ray = np.arange(rays)[:, None, None]
+        pair = cells % half
+        place = ray * half + pair
+        seen = self.bits[np.arange(len(cells))[:, None], place >> 3] >> (7 - (place & 7)) & 1
+        cosines = np.einsum("bi,rbki->rbk", self.normals, self.vectors[ray, pair])
+        return np.sum(np.maximum(np.where(cells < half, cosines, -cosines), 0) * seen, axis=0, dtype=np.float32)
 
     def __matmul__(self, light):
         """Product (n, k) float32 with a matrix (s, k), block by block."""
