@@ -11,8 +11,9 @@ from .directions import parse_directions
 from .memory import resident_bytes
 from .parallel import BLOCK_ROWS, map_chunks
 from .points.points import POINT_BUDGET, sample_points
-from .precompute import LANE_BYTES, POINT_BYTES, Settings
+from .settings import Settings
 from .provenance import left_out
+from .room import LANE_BYTES, POINT_BYTES, held_coefficient_bytes
 from .scene.scene import open_scene
 from .transport.direct import LANES, sample_direct
 
@@ -58,7 +59,8 @@ def describe(source, parameters=None, **settings):
     basis = n * (expanded * probe["expanding"] + multiplied * probe["multiplying"])
     relighting, projection = storage_bytes(settings.basis, n, s, coefficients, rays)
     stored = relighting + projection + n * 77 + s * 24 + 4 * len(points.patches.nodes)
-    working = LANES * LANE_BYTES // 2 + POINT_BYTES * n + fit_bytes(settings.basis, n, s, coefficients) + 2 * relighting
+    working = LANES * LANE_BYTES // 2 + POINT_BYTES * n + fit_bytes(settings.basis, n, s, coefficients)
+    working += held_coefficient_bytes(settings.basis, n, s, coefficients, rays)
     return {
         "requires": _requirements(scene, points, int(probe["rays"] * n)),
         "settings": _reasons(settings, points, directions, coefficients),

@@ -2,141 +2,32 @@
 
 import hashlib
 import time
-from contextlib import closing, contextmanager
-from dataclasses import asdict, dataclass
+from contextlib import closing
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 import scipy.sparse
 
 from .asset import Asset
-from .basis.bases import (
-    check_basis,
-    check_components,
-    coefficient_bytes,
-    default_components,
-    fit_basis,
-    fit_bytes,
-    most_components,
-)
+from .basis.bases import fit_basis
 from .basis.none import NoBasis
 from .basis.rows import Rows
-from .basis.target import Fit, Target, check_room
+from .basis.target import Fit, check_room
 from .directions import parse_directions
 from .errors import SettingsError
 from .memory import free_bytes, parse_bytes, resident_bytes
 from .parallel import BLOCK_ROWS, map_chunks
 from .points.points import POINT_FIELDS, sample_points
 from .provenance import describe_scene
-from .runtime import count_kernels, peak_memory_bytes, thread_count, versions
+from .room import Room, held_coefficient_bytes
+from .runtime import count_kernels, peak_memory_bytes, versions
 from .scene.scene import open_scene
-from .transport.direct import LANES, DirectSampler, find_buried
+from .settings import Settings
+from .transport.direct import DirectSampler, find_buried
 from .workspace import durable, temporary
 
-DEFAULT_VARIANCE = 0.95
-MAX_RAYS_PER_DIRECTION = 64
-LANE_BYTES = 40  # of a wavefront, for each of its rays
-POINT_BYTES = 240  # for each point, what the ray tracer and the fit hold of it beside the points themselves
-LEAST_LANES = 1 << 16
-COPIES = {"haar": 3.2}  # of the stored coefficients in memory, where blocks are put together: indices are wider there; else 2
 OPEN_KEYS = ("coefficients", "variance")  # what may be chosen anew when the fit could not give what was asked for
-
-
-@dataclass(frozen=True)
-class Settings:
-    """What a precomputation is asked to do; stored with the asset.
-
-    Parameters
-    ----------
-    directions : str
-        Direction lattice: ``cubemap:N``, ``latlong:WxH`` or ``halton:N``.
-    basis : str
-        ``pca``, ``sh`` (spherical harmonics), ``haar`` (the best wavelets of each point), ``haar-shared`` (the same for all
-        points) or ``none`` (transport as it was sampled).
-    coefficients : int, 'auto' or None
-        Components of the basis. None takes 48 (49 harmonics), or the rank of the transport where that is lower; an explicit
-        number above the rank is refused; 'auto' takes as few as capture `variance`.
-    variance : float or None
-        Share of the transport's variance that 'auto' captures, 0.95 by default.
-    edge_length : 'auto' or float
-        Metres to which coarse faces and analytic shapes are tessellated.
-    rays_per_direction : int
-        Rays in each cell of the lattice, 1…64.
-    seed : int
-
-    Raises
-    ------
-    SettingsError
-        If a value is out of range or values contradict each other.
-    """
-
-    directions: str = "cubemap:32"
-    basis: str = "pca"
-    coefficients: int | str | None = None
-    variance: float | None = None
-    edge_length: str | float = "auto"
-    rays_per_direction: int = 1
-    seed: int = 0
-
-    def __post_init__(self):
-        lattice = parse_directions(self.directions)
-        plain = {"directions": str(lattice)}
-        check_basis(self.basis)
-        for name, others in (("coefficients", (None, "auto")), ("rays_per_direction", ()), ("seed", ())):
-            value = getattr(self, name)
-            if any(value is other or (isinstance(value, str) and value == other) for other in others):
-                continue
-            if isinstance(value, bool) or not isinstance(value, int | np.integer):
-                raise SettingsError(f"{name} must be an integer{' or auto' if others else ''}, got {value!r}")
-            plain[name] = int(value)
-        for name in ("variance", "edge_length"):
-            value = getattr(self, name)
-            if value is not None and not (name == "edge_length" and isinstance(value, str) and value == "auto"):
-                plain[name] = _number(name, value)
-        # Plain values of one type each: they are stored, and compared when a run is continued.
-        for name, value in plain.items():
-            object.__setattr__(self, name, value)
-        if not 1 <= self.rays_per_direction <= MAX_RAYS_PER_DIRECTION:
-            raise SettingsError(f"rays per direction must be 1…{MAX_RAYS_PER_DIRECTION}, got {self.rays_per_direction}")
-        if self.seed < 0:
-            raise SettingsError(f"seed must be ≥ 0, got {self.seed}")
-        self._check_coefficients(lattice)
-
-    def _check_coefficients(self, lattice):
-        if self.basis == "none" and self.coefficients is not None:
-            raise SettingsError(f"the basis none keeps all directions, so coefficients {self.coefficients} mean nothing: leave them out")
-        if self.coefficients == "auto":
-            if self.variance is None:
-                object.__setattr__(self, "variance", DEFAULT_VARIANCE)
-            Target(variance=self.variance)
-        elif self.variance is not None:
-            raise SettingsError(f"variance {self.variance:g} needs coefficients auto, got {self.coefficients or 'the default'}")
-        elif self.coefficients is not None and self.coefficients < 0:
-            raise SettingsError(f"coefficients must be ≥ 0, got {self.coefficients}")
-        check_components(self.basis, lattice, None if self.coefficients == "auto" else self.coefficients)
-
-    def target(self, points):
-        """What the basis of so many points is asked for, a Target."""
-        if self.variance is not None:
-            return Target(variance=self.variance)
-        directions = parse_directions(self.directions)
-        if self.coefficients is None:
-            return Target(default_components(self.basis, directions, points))
-        largest = most_components(self.basis, directions, points)
-        if self.coefficients > largest:
-            raise SettingsError(
-                f"{self.coefficients} coefficients are above the rank of the transport: {points:,} points and "
-                f"{len(directions):,} directions allow at most {largest}"
-            )
-        return Target(int(self.coefficients))
-
-
-def _number(name, value):
-    try:
-        return float(value)
-    except (TypeError, ValueError):
-        auto = "neither 'auto' nor" if name == "edge_length" else "not"
-        raise SettingsError(f"{name} {value!r} is {auto} a number") from None
 
 
 def precompute(scene, parameters=None, progress=None, output=None, resume=False, max_memory=None, **settings):
@@ -199,11 +90,10 @@ def measure(scene, parameters=None, progress=None, output=None, resume=False, ma
         points = sample_points(scene, settings.edge_length)
         directions = parse_directions(settings.directions)
         target = settings.target(len(points))
-        scene.occluders  # noqa: B018  built before memory is measured: it holds a copy of all triangles
-        room = Room(limit, points, directions, settings, target)
+        room = Room(limit, scene, points, directions, settings, target)
         clock.lap("points")
         run = _identity(settings, scene, points)
-        with _workspace(output, run, resume) as workspace:
+        with temporary() if output is None else durable(output, run, resume, OPEN_KEYS) as workspace:
             sampler = DirectSampler(scene, points, directions, settings.rays_per_direction, room.lanes)
             with closing(workspace.rows("visibility", len(points), sampler.row_bytes)) as bits:
                 _sample(sampler, bits, room.lanes, progress)
@@ -242,60 +132,12 @@ def measure(scene, parameters=None, progress=None, output=None, resume=False, ma
     return asset, cost
 
 
-@contextmanager
-def _workspace(output, run, resume):
-    with temporary() if output is None else durable(output, run, resume, OPEN_KEYS) as workspace:
-        yield workspace
-
-
 def _identity(settings, scene, points):
     """All that the result depends on: what must not change between a run and its continuation."""
     digest = hashlib.sha256(scene.hash.encode())
     for name in POINT_FIELDS:
         digest.update(np.ascontiguousarray(getattr(points, name)).tobytes())
     return {"scene": digest.hexdigest()[:16], "points": len(points), **asdict(settings), "versions": versions()}
-
-
-class Room:
-    """What fits into the memory that a run may take.
-
-    Parameters
-    ----------
-    limit : int
-        Bytes that the process may have resident.
-    points : Points
-    directions : DirectionLattice
-    settings : Settings
-    target : Target
-
-    Attributes
-    ----------
-    lanes : int
-        Rays of a wavefront.
-    basis : int
-        Bytes that fitting a basis may take beside the coefficients.
-
-    Raises
-    ------
-    SettingsError
-        If the least that the run needs does not fit.
-    """
-
-    def __init__(self, limit, points, directions, settings, target):
-        held = resident_bytes()
-        n, s, rays = len(points), len(directions), settings.rays_per_direction
-        components = target.components or 0
-        coefficients = coefficient_bytes(settings.basis, n, s, components, rays)
-        blocks = BLOCK_ROWS * s * (6 * rays + 12) * thread_count()
-        fixed = POINT_BYTES * n + blocks + COPIES.get(settings.basis, 2) * coefficients
-        needed = fixed + fit_bytes(settings.basis, n, s, components) + LANE_BYTES * LEAST_LANES
-        if limit - held < needed:
-            raise SettingsError(
-                f"memory {limit / 1e6:,.0f} MB is too little: the scene holds {held / 1e6:,.0f} MB and the run needs "
-                f"{needed / 1e6:,.0f} MB more; raise max_memory (--max-memory) or use fewer points, directions or coefficients"
-            )
-        self.lanes = int(min(LANES, (limit - held - fixed) // LANE_BYTES))
-        self.basis = limit - held - fixed
 
 
 def _sample(sampler, bits, lanes, progress):
@@ -333,7 +175,7 @@ def _compress(transport, directions, buried, settings, target, room, workspace, 
                 f"{settings.coefficients} coefficients are above the rank of the transport: at most {len(fit.basis)}"
             )
         if target.components is None:
-            size = COPIES.get(settings.basis, 2) * coefficient_bytes(settings.basis, *transport.shape, len(fit.basis))
+            size = held_coefficient_bytes(settings.basis, *transport.shape, len(fit.basis))
             check_room(f"keeping {len(fit.basis):,} coefficients of {n:,} points", size, room.basis)
     except SettingsError as error:
         if not workspace.lasting:

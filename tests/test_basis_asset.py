@@ -5,7 +5,6 @@ import json
 import os
 import subprocess
 import sys
-from pathlib import Path
 from types import SimpleNamespace
 
 import h5py
@@ -16,7 +15,7 @@ import threadpoolctl
 import mi_prt
 import mi_prt.transport.direct
 from conftest import bias, cube, diffuse, disk, rectangle, relative_l2, scene, sphere, uniform_sky
-from mi_prt import AssetError, SettingsError
+from mi_prt import AssetError, SettingsError, room
 from mi_prt.basis import pca
 from mi_prt.basis.pca import fit_pca
 from mi_prt.basis.rows import Rows
@@ -542,9 +541,11 @@ def test_blocks_share_their_kernels(monkeypatch):
     same bits: rays do not know their block.
     """
     parts = SMALL | {"inner": sphere((0.2, 0.4, 0), 0.1)}  # inside the box: dark, so that the search for buried points runs
+    blocks = []
     whole, _ = measure(scene(**parts), directions="cubemap:8", edge_length=0.4)
-    monkeypatch.setattr(mi_prt.transport.direct, "LANES", 384 * 7)
-    blocked, cost = measure(scene(**parts), directions="cubemap:8", edge_length=0.4)
+    monkeypatch.setattr(room, "LANES", 384 * 7)
+    blocked, cost = measure(scene(**parts), None, lambda *event: blocks.append(event), directions="cubemap:8", edge_length=0.4)
+    assert blocks[0][2] > 20
     assert len(whole.points) > 10 * 7 and whole.buried.sum() > 7
     assert cost["kernels"] <= 4
     np.testing.assert_array_equal(blocked.buried, whole.buried)

@@ -14,7 +14,7 @@ import pytest
 import mi_prt
 import mi_prt.runtime
 from conftest import cube, diffuse, disk, rectangle, scene
-from mi_prt import AssetError, SettingsError
+from mi_prt import AssetError, SettingsError, room
 from mi_prt.basis import pca
 from mi_prt.memory import resident_bytes
 from mi_prt.runtime import thread_count as mitsuba_threads
@@ -53,10 +53,11 @@ PROGRAM = """
 import sys, time
 sys.path.insert(0, sys.argv[1])
 import mi_prt
+from mi_prt import room
 from mi_prt.basis import pca
 from test_resume import LANES, SCENE, SETTINGS
 pca.NEGLIGIBLE = 0
-sys.modules["mi_prt.precompute"].LANES = LANES
+room.LANES = LANES
 def progress(stage, done, total, detail):
     print(stage, done, total, flush=True)
     time.sleep(0.002)  # moments between the writes, in which a signal may arrive as well
@@ -103,7 +104,7 @@ def test_killed_runs_end_in_the_same_file(undisturbed, tmp_path, chain):
 @pytest.mark.parametrize("stage", ["transport", "basis", "coefficients"])
 def test_interrupts_keep_what_was_computed(undisturbed, tmp_path, monkeypatch, stage):
     """Ctrl-C in the middle of each stage: no file, the rows of before are there, and continuing gives the same file."""
-    monkeypatch.setattr(sys.modules["mi_prt.precompute"], "LANES", LANES)  # the function has the module's name
+    monkeypatch.setattr(room, "LANES", LANES)
     path, seen = tmp_path / "asset.prt", []
 
     def interrupt(at, done, total, detail):

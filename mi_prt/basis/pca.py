@@ -52,7 +52,14 @@ class PCA(LinearBasis):
         return compensated @ (self.vectors @ (radiance * self.sqrt_weights[:, None]))
 
 
-def fit_pca(rows, target, seed=0, progress=lambda done, total: None, max_bytes=np.inf, keep=lambda name, compute: compute()):
+def fit_pca(
+    rows: Rows,
+    target: Target,
+    seed=0,
+    progress=lambda done, total: None,
+    max_bytes=np.inf,
+    keep=lambda name, compute: compute(),
+) -> Fit:
     """Fit principal components to a matrix that is only ever seen in blocks of rows.
 
     Parameters
