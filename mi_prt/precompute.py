@@ -180,7 +180,9 @@ def _compress(transport, directions, buried, settings, target, room, workspace, 
     except SettingsError as error:
         if not workspace.lasting:
             raise
-        # Only the fit could tell. The rays are kept for another choice of coefficients, or more memory.
+        # Only the fit could tell. The rays are kept for another choice of coefficients, or more memory; the passes of this fit
+        # are not, because another one may start elsewhere.
+        workspace.forget_arrays()
         workspace.record({key: value for key, value in run.items() if key not in OPEN_KEYS})
         raise SettingsError(f"all rays are traced and kept, resume (--resume) goes on from them, but {error}") from None
     return fit, _encode(fit.basis, transport, progress)

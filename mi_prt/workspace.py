@@ -58,6 +58,11 @@ class Workspace:
         """Note which run this workspace belongs to, a dict for JSON."""
         _write_whole(self.folder / _RUN, json.dumps(run, sort_keys=True).encode())
 
+    def forget_arrays(self):
+        """Delete all arrays; the rows stay."""
+        for path in self.folder.glob("*.array"):
+            path.unlink()
+
     def remove(self):
         """Delete the folder; from the first moment on it is no run that could be continued."""
         (self.folder / _RUN).unlink(missing_ok=True)

@@ -324,6 +324,28 @@ def test_a_share_that_is_out_of_reach_costs_no_rays(tmp_path):
     assert seen[0][:3] == ("transport", seen[0][2], seen[0][2])
 
 
+def test_passes_of_a_fit_that_failed_do_not_reach_another(tmp_path, monkeypatch):
+    """A search for a share of the variance starts its later fits from earlier ones. When it fails and so many components are
+    asked for outright, that fit is the one of an undisturbed run."""
+    module, tried = sys.modules["mi_prt.precompute"], []
+    leading = pca._leading
+    monkeypatch.setattr(pca, "_leading", lambda *arguments: tried.append(arguments[2]) or leading(*arguments))
+    auto = SETTINGS | dict(coefficients="auto", variance=0.993)
+
+    def refuse(*_):
+        raise SettingsError("no room")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "check_room", refuse)
+        with pytest.raises(SettingsError, match="no room"):
+            mi_prt.precompute(SCENE, output=tmp_path / "a.prt", **auto)
+    assert len(tried) > 1
+    outright = SETTINGS | dict(coefficients=tried[1])
+    mi_prt.precompute(SCENE, output=tmp_path / "a.prt", resume=True, **outright)
+    mi_prt.precompute(SCENE, output=tmp_path / "b.prt", **outright)
+    assert (tmp_path / "a.prt").read_bytes() == (tmp_path / "b.prt").read_bytes()
+
+
 def test_an_unfinished_run_is_no_asset(unfinished):
     for path in [unfinished, partial(unfinished), partial(unfinished) / "visibility.rows"]:
         with pytest.raises(AssetError):
