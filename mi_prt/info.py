@@ -11,10 +11,10 @@ from .directions import parse_directions
 from .memory import resident_bytes
 from .parallel import BLOCK_ROWS, map_chunks
 from .points.points import POINT_BUDGET, sample_points
-from .settings import Settings
 from .provenance import left_out
 from .room import LANE_BYTES, POINT_BYTES, held_coefficient_bytes
 from .scene.scene import open_scene
+from .settings import Settings
 from .transport.direct import LANES, sample_direct
 
 PROBE_POINTS = 256
@@ -139,7 +139,6 @@ def _probe(scene, points, directions, settings, coefficients):
     started = time.perf_counter()
     transport = sample_direct(scene, few, directions, settings.rays_per_direction)
     rate = max(transport.rays, 1) / (time.perf_counter() - started)
-    index = np.arange(len(few))
     vectors = np.ones((len(directions), coefficients), np.float32)
     rows = transport.rows(slice(0, BLOCK_ROWS))
     seconds = {}
@@ -148,7 +147,7 @@ def _probe(scene, points, directions, settings, coefficients):
         started = time.perf_counter()
         list(map_chunks(lambda _: run(), range(PROBE_BLOCKS)))
         seconds[name] = (time.perf_counter() - started) / (PROBE_BLOCKS * len(rows))
-    return {"rays": transport.rays / len(index), "rate": rate} | seconds
+    return {"rays": transport.rays / len(few), "rate": rate} | seconds
 
 
 def _requirements(scene, points, rays):

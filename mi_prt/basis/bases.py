@@ -7,7 +7,7 @@ from . import haar, harmonics, pca
 from .haar import HaarBasis, SharedHaarBasis, check_haar, fit_haar, fit_haar_shared
 from .harmonics import HarmonicBasis, check_harmonics, fit_harmonics, most_harmonics
 from .none import NoBasis
-from .pca import PCA, fit_pca
+from .pca import PCA, compute_anew, fit_pca
 
 BASES = {basis.kind: basis for basis in (PCA, HarmonicBasis, HaarBasis, SharedHaarBasis, NoBasis)}
 DEFAULT_COEFFICIENTS = 48
@@ -22,7 +22,7 @@ def check_basis(kind):
         raise SettingsError(f"basis '{kind}' is not known: use {', '.join(BASES)}")
 
 
-def fit_basis(kind, rows, target, seed=0, progress=lambda done, total: None, max_bytes=inf, keep=None):
+def fit_basis(kind, rows, target, seed=0, progress=lambda done, total: None, max_bytes=inf, keep=compute_anew):
     """Fit a basis that has components to choose (all but `none`) to rows of transport.
 
     Parameters
@@ -34,7 +34,7 @@ def fit_basis(kind, rows, target, seed=0, progress=lambda done, total: None, max
     progress : callable(done, total)
     max_bytes : float
         Memory that the fit may take.
-    keep : callable(name, compute), optional
+    keep : callable(name, compute)
         See `fit_pca`, the one fit that takes more than a pass or two.
 
     Returns
@@ -47,7 +47,7 @@ def fit_basis(kind, rows, target, seed=0, progress=lambda done, total: None, max
         If the basis cannot be had in that number, on that lattice, or in that memory.
     """
     if kind == "pca":
-        return fit_pca(rows, target, seed, progress, max_bytes, **({"keep": keep} if keep else {}))
+        return fit_pca(rows, target, seed, progress, max_bytes, keep)
     return _FITS[kind](rows, target, seed, progress, max_bytes)
 
 

@@ -248,25 +248,11 @@ def fit_haar(rows: Rows, target: Target, seed=0, progress=lambda done, total: No
         If the lattice is another, or the number of components out of range.
     """
     check_haar(rows.directions, target.components)
-    transform = haar_transform(rows.directions.resolution)
-    n, s = rows.shape
-
-    def energies(chunk):
-        total, energies = np.zeros((2, s))
-        for block in rows.blocks(chunk):
-            coefficients = transform.forward(block)
-            total += coefficients.sum(axis=0)
-            squares = np.square(coefficients, out=coefficients)
-            squares.sort(axis=1)
-            energies += squares.sum(axis=0)[::-1]
-        return total, energies
-
-    total, energies = rows.sums(energies)
+    energies, variance = _energies(rows, ranked=True)
     progress(1, 1)
-    energy = float(energies.sum())
-    variance = centred(energy, total, n)
     components, residual = _fewest(target, energies, variance)
-    return fit_of(HaarBasis(rows.sqrt_weights, shares(energies[:components], variance)), residual, variance, energy)
+    basis = HaarBasis(rows.sqrt_weights, shares(energies[:components], variance))
+    return fit_of(basis, residual, variance, energies.sum())
 
 
 def fit_haar_shared(rows: Rows, target: Target, seed=0, progress=lambda done, total: None, max_bytes=inf) -> Fit:
@@ -280,34 +266,46 @@ def fit_haar_shared(rows: Rows, target: Target, seed=0, progress=lambda done, to
         Of a `SharedHaarBasis`, its wavelets in descending order of energy.
     """
     check_haar(rows.directions, target.components)
-    transform = haar_transform(rows.directions.resolution)
-    n, s = rows.shape
-
-    def energies(chunk):
-        total, energies = np.zeros((2, s))
-        for block in rows.blocks(chunk):
-            coefficients = transform.forward(block)
-            total += coefficients.sum(axis=0)
-            energies += np.square(coefficients, out=coefficients).sum(axis=0)
-        return total, energies
-
-    total, energies = rows.sums(energies)
+    energies, variance = _energies(rows, ranked=False)
     progress(1, 1)
-    energy = float(energies.sum())
-    variance = centred(energy, total, n)
     order = np.argsort(-energies, kind="stable")
     components, residual = _fewest(target, energies[order], variance)
+    s = len(energies)
     check_room(f"a basis of {components:,} wavelets", FIT_BYTES * components * s, max_bytes)
     chosen = order[:components]
     vectors = np.zeros((components, s), np.float32)
     vectors[np.arange(components), chosen] = 1
     basis = SharedHaarBasis(
-        transform.inverse(vectors) * rows.sqrt_weights,
+        haar_transform(rows.directions.resolution).inverse(vectors) * rows.sqrt_weights,
         np.zeros(s, np.float32),
         rows.sqrt_weights,
         shares(energies[chosen], variance),
     )
-    return fit_of(basis, residual, variance, energy)
+    return fit_of(basis, residual, variance, energies.sum())
+
+
+def _energies(rows, ranked):
+    """Energies (s,) of the coefficients of all rows, and the rows' variance.
+
+    They are of each wavelet, or `ranked` of the rows' largest coefficient, their second largest, ….
+    """
+    transform = haar_transform(rows.directions.resolution)
+    s = rows.shape[1]
+
+    def sums(chunk):
+        energies, total = np.zeros((2, s))
+        for block in rows.blocks(chunk):
+            coefficients = transform.forward(block)
+            total += coefficients.sum(axis=0)
+            squares = np.square(coefficients, out=coefficients)
+            if ranked:
+                squares.sort(axis=1)
+                squares = squares[:, ::-1]
+            energies += squares.sum(axis=0)
+        return energies, total
+
+    energies, total = rows.sums(sums)
+    return energies, centred(float(energies.sum()), total, len(rows.index))
 
 
 def check_haar(directions, components=None):

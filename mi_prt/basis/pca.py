@@ -52,13 +52,18 @@ class PCA(LinearBasis):
         return compensated @ (self.vectors @ (radiance * self.sqrt_weights[:, None]))
 
 
+def compute_anew(name, compute):
+    """The `keep` of `fit_pca` that keeps nothing."""
+    return compute()
+
+
 def fit_pca(
     rows: Rows,
     target: Target,
     seed=0,
     progress=lambda done, total: None,
     max_bytes=np.inf,
-    keep=lambda name, compute: compute(),
+    keep=compute_anew,
 ) -> Fit:
     """Fit principal components to a matrix that is only ever seen in blocks of rows.
 

@@ -70,6 +70,9 @@ class DirectTransport:
         """The transport of some points, still as bits."""
         return replace(self, normals=self.normals[index], bits=self.bits[index])
 
+    def __array__(self, dtype=None, copy=None):
+        return self.rows(slice(None)).astype(dtype or np.float32, copy=False)
+
     def entries(self, cells):
         """Single entries (n, k) float32 of the matrix: those of each row in cells (n, k), without expanding it."""
         rays, half, _ = self.vectors.shape
