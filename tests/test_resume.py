@@ -441,7 +441,7 @@ def test_too_little_memory_says_how_much_is_needed():
 
 
 def test_a_run_stays_within_its_memory_and_gives_the_same_file(undisturbed, tmp_path):
-    """The peak of a fresh process, by the kernel's own count, with a limit that is a quarter of what it takes by default."""
+    """The peak of a fresh process, by the kernel's own count, with a limit that a whole wavefront does not fit into."""
     code = """
 import sys; sys.path.insert(0, sys.argv[1])
 import mi_prt
@@ -453,13 +453,17 @@ from test_resume import SCENE, SETTINGS
 pca.NEGLIGIBLE = 0
 mi_prt.precompute(SCENE, directions="cubemap:2", edge_length=1)  # what Mitsuba and Embree take once
 limit = resident_bytes() + 60_000_000
-mi_prt.precompute(SCENE, output=sys.argv[2], max_memory=limit, **SETTINGS)
-print(limit, peak_memory_bytes())
+def blocks(**options):
+    events = []
+    mi_prt.precompute(SCENE, progress=lambda *event: events.append(event), **options, **SETTINGS)
+    return events[0][2]
+limited = blocks(output=sys.argv[2], max_memory=limit)
+print(limit, peak_memory_bytes(), limited, blocks())
 """
     ran = subprocess.run(
         [sys.executable, "-c", code, os.path.dirname(__file__), str(tmp_path / "a.prt")], capture_output=True, text=True, timeout=120
     )
     assert ran.returncode == 0, ran.stderr[-2000:]
-    limit, peak = map(int, ran.stdout.split())
-    assert peak <= limit
+    limit, peak, limited, blocks = map(int, ran.stdout.split())
+    assert peak <= limit and limited > blocks
     assert (tmp_path / "a.prt").read_bytes() == undisturbed.read_bytes()
