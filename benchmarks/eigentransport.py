@@ -6,9 +6,7 @@ DIR holds meshes/*.ply and hdr/*.exr (see benchmarks/README.md). With --only the
 Nothing else should run on the machine meanwhile: some sections tell times.
 """
 
-import argparse
 import json
-import re
 import subprocess
 import sys
 import tempfile
@@ -37,12 +35,11 @@ from mi_prt.render.image import coverage, pick_sensor, render_image, resized
 from mi_prt.runtime import mitsuba
 from mi_prt.scene.scene import open_scene
 from mi_prt.transport.direct import sample_direct
+from page import ROOT, saved, write_page
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
 
-ROOT = Path(__file__).resolve().parent.parent
-ASSETS = ROOT.parent / "shared" / "assets"
 MESHES = ("teapot", "bunny", "horse")
 PAPER_MESHES = ("bunny", "horse", "dragon", "buddha", "camel", "spot", "teapot", "chinese_dragon")
 DIRECTIONS = Cubemap(32)
@@ -56,32 +53,8 @@ POINT_SAMPLES = 8192
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--assets", type=Path, default=ASSETS)
-    parser.add_argument("--output", type=Path, default=ROOT / "docs" / "eigentransport.md")
-    parser.add_argument("--only", default="", help=f"some of {', '.join(SECTIONS)}")
-    arguments = parser.parse_args()
     warnings.simplefilter("ignore", LightWarning)
-    chosen = [name for name in arguments.only.split(",") if name] or list(SECTIONS)
-    if unknown := set(chosen) - set(SECTIONS):
-        parser.error(f"--only {','.join(sorted(unknown))}: choose from {', '.join(SECTIONS)}")
-    pictures = arguments.output.with_suffix("")
-    pictures.mkdir(parents=True, exist_ok=True)
-    sections = _existing(arguments.output)
-    for name in chosen:
-        started = time.perf_counter()
-        sections[name] = "\n".join(SECTIONS[name](arguments.assets, pictures)).strip()
-        print(f"{sections[name]}\n\n({name}: {time.perf_counter() - started:.0f} s)\n", flush=True)
-        page = [HEAD] + [f"<!-- {name} -->\n{sections[name]}" for name in SECTIONS if name in sections]
-        arguments.output.write_text("\n\n".join(page) + "\n")
-
-
-def _existing(path):
-    """The sections of a page by their names."""
-    if not path.exists():
-        return {}
-    parts = re.split(r"<!-- (\w+) -->\n", path.read_text())
-    return dict(zip(parts[1::2], (part.strip() for part in parts[2::2])))
+    write_page(__doc__, HEAD, SECTIONS, "eigentransport.md")
 
 
 HEAD = """# The Eigentransport paper, measured
@@ -153,7 +126,7 @@ def captured_variance(assets, pictures):
             axes.plot(np.arange(1, len(total) + 1), total, f"C{i}{'--' if plane else '-'}", label=name)
     axes.set(xscale="log", xlabel="components", ylabel="captured variance", ylim=(0.3, 1))
     axes.grid(alpha=0.3), axes.legend(fontsize=8)
-    yield _saved(figure, pictures, "variance")
+    yield saved(figure, pictures, "variance")
     worse = [mesh for mesh in MESHES if _more(needed[mesh, True][1], needed[mesh, False][1])]
     better = [mesh for mesh in MESHES if _more(needed[mesh, False][1], needed[mesh, True][1])]
     yield (
@@ -193,7 +166,7 @@ def transport_error(assets, pictures):
         row[1].set(xscale="log"), row[1].grid(alpha=0.3, which="both")
     axes[-1][0].set_xlabel("coefficients"), axes[-1][1].set_xlabel("stored MB, projection included")
     axes[0][0].legend(fontsize=7)
-    yield _saved(figure, pictures, "error")
+    yield saved(figure, pictures, "error")
     yield "Where the others pass below PCA:\n"
     yield "| scene | basis | at equal count | at equal bytes (indices and projection counted) |\n|---|---|---|---|"
     yield from crossings
@@ -248,7 +221,7 @@ def transport_functions(assets, pictures):
             axes[i][j].imshow(row[cells].reshape(64, 128), vmin=0, vmax=1, cmap="gray"), axes[i][j].set_axis_off()
         axes[0][j].set_title(name, fontsize=8)
     yield "\nTransport of three points of the bunny on a plane, latitude and longitude:\n"
-    yield _saved(figure, pictures, "functions")
+    yield saved(figure, pictures, "functions")
 
 
 def shading(assets, pictures):
@@ -268,7 +241,7 @@ def shading(assets, pictures):
         yield "|---|---:|---:|---:|---:|---:|---:|"
         at_points = None
         for kind, components in [("pca", d) for d in SHADING] + [("sh", 36), ("haar", 36), ("none", None)]:
-            asset = mi_prt.precompute(path, basis=kind, coefficients=components, rays_per_direction=4)
+            asset = mi_prt.precompute(path, basis=kind, coefficients=components, rays_per_direction=4, bounces=0)
             if at_points is None:
                 chosen = np.sort(np.random.default_rng(0).permutation(len(asset.points))[:3000])
                 at_points = point_irradiance(truth, asset.points.at(chosen), POINT_SAMPLES)
@@ -287,7 +260,7 @@ def shading(assets, pictures):
     figure, axes = plt.subplots(2, 4, figsize=(12, 4.8))
     for axis, (name, picture) in zip(axes.flat, shown):
         axis.imshow(display(picture, factor)), axis.set_axis_off(), axis.set_title(name, fontsize=9)
-    yield _saved(figure, pictures, "shading")
+    yield saved(figure, pictures, "shading")
 
 
 def rotation(assets, pictures):
@@ -420,7 +393,7 @@ def local_lights(assets, pictures):
     )
     sampled = Sampled(assets, "bunny", True)
     yield "| height, m | inside the hull | pca, k = 1: RMSE | bias | k = 4: RMSE | bias | none, k = 1: RMSE | bias |\n|---:|---|" + "---:|" * 6
-    pca, none = (mi_prt.precompute(sampled.scene.mi_scene, **settings) for settings in (dict(coefficients=192), dict(basis="none")))
+    pca, none = (mi_prt.precompute(sampled.scene.mi_scene, **settings) for settings in (dict(coefficients=192, bounces=0), dict(basis="none")))
     chosen = np.sort(np.random.default_rng(0).permutation(len(pca.points))[:4000])
     for height in (20.0, 8.0, 4.0, 2.5, 1.6, 1.1, 0.6):
         light = mi_prt.PointLight((1.2, height, 0.8), 100.0)
@@ -529,13 +502,6 @@ def _median_of(repeat, run):
 
 def _listed(names):
     return ", ".join(names) or "none"
-
-
-def _saved(figure, pictures, name):
-    figure.tight_layout()
-    figure.savefig(pictures / f"{name}.png", dpi=110)
-    plt.close(figure)
-    return f"\n![{name}]({pictures.name}/{name}.png)\n"
 
 
 if __name__ == "__main__":

@@ -68,16 +68,21 @@ def kernels(scene, points, directions):
 
 
 def relighting(path, repeat):
-    """Relighting alone, and turning + projecting + relighting."""
-    asset = mi_prt.precompute(path, coefficients=48)
+    """Relighting alone, and turning + projecting + relighting; of direct light, and of light that reflections colour."""
+    for bounces, bound in ((0, "≤ 2"), ("auto", "")):
+        asset = mi_prt.precompute(path, coefficients=48, bounces=bounces)
+        what = "direct light" if bounces == 0 else "with coloured reflections"
+        light = asset.project_light(scene_light(open_scene(path)))
+        relit = [_timed(lambda: asset.outgoing_radiance(asset.irradiance_from(*light))) for _ in range(20 * repeat)]
+        copied = [_timed(asset.coefficients.copy) for _ in range(20 * repeat)]
+        _row(f"relight {len(asset.points):,} points, 48 coefficients, {what}, ms", f"{1e3 * np.median(relit):.2f}", bound)
+        _row("relight / copy of the coefficients (memory bandwidth)", f"{np.median(relit) / np.median(copied):.2f}", "")
+        _turning(asset, path, repeat)
+
+
+def _turning(asset, path, repeat):
     prepared = asset.prepare_light(scene_light(open_scene(path)))
-    light = asset.project_light(prepared)
-    relit = [_timed(lambda: asset.outgoing_radiance(asset.irradiance_from(*light))) for _ in range(20 * repeat)]
     turned = [_timed(lambda: asset.relight(prepared.rotated("y", k))) for k in range(10 * repeat)]
-    copied = [_timed(asset.coefficients.copy) for _ in range(20 * repeat)]
-    n = len(asset.points)
-    _row(f"relight {n:,} points, 48 coefficients, RGB, ms", f"{1e3 * np.median(relit):.2f}", "≤ 2")
-    _row("relight / copy of the coefficients (memory bandwidth)", f"{np.median(relit) / np.median(copied):.2f}", "")
     _row("turn + project + relight, times/s", f"{1 / np.median(turned):.0f}", "≥ 100")
 
 

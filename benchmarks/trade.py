@@ -3,7 +3,8 @@
 Usage: python benchmarks/trade.py [SCENE.xml] [--plot docs/trade.png]
 
 Prints a Markdown table and draws the plot. Errors are those of irradiance at 2,000 points under the scene's own light
-turned to four angles, against Mitsuba's emitter sampling, with the reference's noise taken out.
+turned to four angles, reflections included, against Mitsuba's emitter sampling and path tracer, with the reference's noise
+taken out.
 """
 
 import argparse
@@ -13,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from mi_prt.evaluate import metrics
-from mi_prt.evaluate.ground_truth import point_irradiance
+from mi_prt.evaluate.ground_truth import irradiance
 from mi_prt.lighting.scene_light import lit_scene, scene_light
 from mi_prt.precompute import measure
 from mi_prt.scene.scene import open_scene
@@ -42,7 +43,7 @@ def main():
             if truths is None:
                 chosen = np.sort(np.random.default_rng(0).permutation(len(asset.points))[:2000])
                 at = asset.points.at(chosen)
-                truths = [point_irradiance(lit_scene(scene.mi_scene, light), at, 8192) for light in lights]
+                truths = [irradiance(lit_scene(scene.mi_scene, light), at, 8192, 2048) for light in lights]
             projected = [asset.project_light(light) for light in lights]
             results = np.stack([asset.irradiance_from(*light)[chosen] for light in projected])
             expected = np.stack([truth.mean for truth in truths])

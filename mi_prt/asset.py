@@ -27,14 +27,16 @@ class Asset:
     directions : DirectionLattice
     basis : a basis of `basis.bases.BASES`
     coefficients : (n, d) float32
-        An array; a sparse array for the basis `haar`; the sampled `DirectTransport` (n, s) for the basis `none`.
+        An array, (n, 3, d) where reflections colour the light and the basis does not; a sparse array for the basis `haar`; the sampled
+        `DirectTransport` (n, s) for the basis `none`.
     scene : dict
         kind, path, parameters, hash and left_out (what of the scene is not modelled).
     settings : dict
         What the run used.
     versions : dict
     report : dict
-        Counts from sampling (rays, dark and buried points), captured variance and relative error of the transport.
+        Counts from sampling (rays, dark and buried points), captured variance and relative error of the transport, and how light
+        splits by reflections (see `indirect`).
     path : Path or None
         The file it was loaded from or saved to.
     """
@@ -86,6 +88,22 @@ class Asset:
         """
         return self.basis.prepare(as_light(light), self.directions)
 
+    @property
+    def channels(self):
+        """Colour channels of transport: 3 where reflections colour the light, else 1."""
+        return self.report.get("channels", 1)
+
+    @cached_property
+    def _channels_apart(self):
+        """Whether each channel has coefficients of its own."""
+        return isinstance(self.coefficients, np.ndarray) and self.coefficients.ndim == 3
+
+    @property
+    def reference_bounces(self):
+        """Reflections that the truth has: as many as were asked for; None, any number, where that was left to the scene."""
+        bounces = self.settings["bounces"]
+        return None if bounces == "auto" else bounces
+
     # --- relighting ----------------------------------------------------------------------------------------------
 
     def irradiance(self, light, nearest=1):
@@ -116,7 +134,10 @@ class Asset:
         What compression leaves of the sum below zero is zero.
         """
         with one_blas_thread():
-            irradiance = self.coefficients @ coefficients
+            if self._channels_apart:
+                irradiance = np.matmul(self.coefficients.swapaxes(0, 1), coefficients.T[..., None])[..., 0].T
+            else:
+                irradiance = self.coefficients @ coefficients
         irradiance += mean_response
         for light in point_lights:
             irradiance += self._arriving(light, nearest)
@@ -136,7 +157,7 @@ class Asset:
             return self.basis.at(self.coefficients[block], cells[block]).mean(axis=1)
 
         seen = np.concatenate(list(map_chunks(transport, range(0, len(self.points), BLOCK_ROWS))))
-        return irradiance * seen[:, None]
+        return irradiance * (seen if seen.ndim == 2 else seen[:, None])
 
     def relight(self, light, nearest=1):
         """Outgoing radiance B = ρ/π · E at the points, (n, 3) float32 in W/(m²·sr). See `irradiance`."""
@@ -151,7 +172,7 @@ class Asset:
         return self.points.albedo * np.float32(1 / np.pi)
 
     def transport(self, rows):
-        """Transport (len(rows), s) float32 as the basis reconstructs it; `rows` indexes points."""
+        """Transport (len(rows), s) float32 as the basis reconstructs it, or (len(rows), 3, s); `rows` indexes points."""
         return self.basis.reconstruct(self.coefficients[rows])
 
     # --- file ----------------------------------------------------------------------------------------------------

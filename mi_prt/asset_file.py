@@ -21,7 +21,7 @@ from .points.points import POINT_FIELDS, Points
 from .transport.direct import DirectTransport
 
 FORMAT = "mi_prt asset"
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 UNITS = {
     "points/positions": "m",
     "points/areas": "m^2",
@@ -203,7 +203,8 @@ def _read(file, path):
         "path": path.absolute(),
         **{name: json.loads(file.attrs[name]) for name in _TEXTS},
     }
-    _check_shapes(**{name: fields[name] for name in ("points", "buried", "directions", "basis", "coefficients")})
+    channels = fields["report"]["channels"]
+    _check_shapes(channels, **{name: fields[name] for name in ("points", "buried", "directions", "basis", "coefficients")})
     return fields
 
 
@@ -224,11 +225,13 @@ def _read_coefficients(file, points, directions):
     return scipy.sparse.csr_array((values.ravel(), index.ravel().astype(np.int32), row_ends(n, k)), (n, directions))
 
 
-def _check_shapes(points, buried, directions, basis, coefficients):
+def _check_shapes(channels, points, buried, directions, basis, coefficients):
     """Raise ValueError unless the arrays of an asset fit together."""
     n, s, d = len(points), len(directions), len(basis)
     patches = points.patches
     p = len(patches.levels)
+    joint = channels == 1 or basis.kind == "pca"  # whether one set of coefficients serves all channels
+    row = (channels, s) if joint and channels > 1 else (s,)
     expected = {
         **{f"points/{name}": (getattr(points, name), (n, 3)) for name in POINT_FIELDS[:5]},
         "points/uv": (points.uv, (n, 2)),
@@ -238,9 +241,9 @@ def _check_shapes(points, buried, directions, basis, coefficients):
         "points/patches/offsets": (patches.offsets, (p,)),
         "points/patches/back": (patches.back, (p,)),
         "points/patches/nodes": (patches.nodes, (int(node_count(*patches.levels.T.astype(np.int64)).sum()),)),
-        "coefficients": (coefficients, (n, s if basis.kind == "haar" else d)),
+        "coefficients": (coefficients, (n, s if basis.kind == "haar" else d) if joint else (n, channels, d)),
     }
-    shapes = {"vectors": (d, s), "mean": (s,), "sqrt_weights": (s,), "weights": (s,), "captured_variance": (d,)}
+    shapes = {"vectors": (d, *row), "mean": row, "sqrt_weights": (s,), "weights": (s,), "captured_variance": (d,)}
     expected |= {f"basis/{name}": (getattr(basis, name), shapes[name]) for name in basis.ARRAYS}
     for name, (array, shape) in expected.items():
         if array.shape != shape:

@@ -70,6 +70,19 @@ EdgeLength = Annotated[
     str, typer.Option("--edge-length", metavar="auto|METRES", help="Coarse faces are tessellated down to this.")
 ]
 Rays = Annotated[int, typer.Option("--rays-per-direction", metavar="R", help="Rays in each cell; 4 antialias shadows.")]
+Bounces = Annotated[
+    Optional[str],
+    typer.Option("--bounces", metavar="B|auto", help="Reflections of light [auto: until 0.1 % is left; haar and none: 0]."),
+]
+Indirect = Annotated[
+    str, typer.Option("--indirect", metavar="solve|paths", help="Reflections from point to point, or by unbiased path tracing.")
+]
+Paths = Annotated[
+    str, typer.Option("--paths-per-point", metavar="N|auto", help="Rays for reflections; auto: noise below 1 % of the transport.")
+]
+Denoise = Annotated[
+    bool, typer.Option("--denoise/--no-denoise", help="Take noise that can be told out of reflected light.")
+]
 Seed = Annotated[int, typer.Option("--seed", help="Same seed, same result.")]
 
 
@@ -97,6 +110,10 @@ def info(
     variance: Variance = None,
     edge_length: EdgeLength = "auto",
     rays_per_direction: Rays = 1,
+    bounces: Bounces = None,
+    indirect: Indirect = "solve",
+    paths_per_point: Paths = "auto",
+    denoise: Denoise = True,
     define: Define = None,
     as_json: Json = False,
 ):
@@ -113,16 +130,21 @@ def info(
             _parameters(define),
             directions=directions,
             basis=basis,
-            coefficients=_count(coefficients),
+            coefficients=_count("coefficients", coefficients),
             variance=variance,
             edge_length=edge_length,
             rays_per_direction=rays_per_direction,
+            bounces=_count("bounces", bounces),
+            indirect=indirect,
+            paths_per_point=_count("paths-per-point", paths_per_point),
+            denoise=denoise,
         )
     _print_json(found) if as_json else _print_nested(found)
 
 
 @app.command(
     epilog="Examples: mi-prt precompute scenes/teapot.xml -o teapot.prt --coefficients 96 -D spp=16\n\n"
+    "mi-prt precompute scenes/cornell_sky.xml -o cornell.prt --bounces 3 --paths-per-point 512\n\n"
     "mi-prt precompute scenes/teapot.xml -o teapot.prt --coefficients auto --variance 0.98 --max-memory 2G --resume"
 )
 def precompute(
@@ -134,6 +156,10 @@ def precompute(
     variance: Variance = None,
     edge_length: EdgeLength = "auto",
     rays_per_direction: Rays = 1,
+    bounces: Bounces = None,
+    indirect: Indirect = "solve",
+    paths_per_point: Paths = "auto",
+    denoise: Denoise = True,
     seed: Seed = 0,
     resume: Annotated[bool, typer.Option("--resume", help="Continue an interrupted run of this file, if there is one.")] = False,
     max_memory: Annotated[
@@ -164,10 +190,14 @@ def precompute(
             max_memory,
             directions=directions,
             basis=basis,
-            coefficients=_count(coefficients),
+            coefficients=_count("coefficients", coefficients),
             variance=variance,
             edge_length=edge_length,
             rays_per_direction=rays_per_direction,
+            bounces=_count("bounces", bounces),
+            indirect=indirect,
+            paths_per_point=_count("paths-per-point", paths_per_point),
+            denoise=denoise,
             seed=seed,
         )
     cost["seconds"]["total"] = round(time.perf_counter() - started, 4)
@@ -177,6 +207,7 @@ def precompute(
         "points": len(asset.points),
         "directions": len(asset.directions),
         "coefficients": len(asset.basis),
+        "bounces": asset.report["bounces"],
         "captured_variance": asset.report["captured_variance"],
         "relative_error": asset.report["relative_error"],
         "bytes": output.stat().st_size,
@@ -291,14 +322,14 @@ def _parameters(define):
     return parameters
 
 
-def _count(text):
-    """Number of coefficients, 'auto' or None."""
+def _count(option, text):
+    """A whole number, 'auto' or None."""
     if text in (None, "auto"):
         return text
     try:
         return int(text)
     except ValueError:
-        raise SettingsError(f"--coefficients {text} is neither a whole number nor auto") from None
+        raise SettingsError(f"--{option} {text} is neither a whole number nor auto") from None
 
 
 def _light(envmap, specs):

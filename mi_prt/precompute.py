@@ -2,8 +2,9 @@
 
 import hashlib
 import time
+from collections.abc import Callable
 from contextlib import closing
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -13,20 +14,24 @@ from .asset import Asset
 from .basis.bases import fit_basis
 from .basis.none import NoBasis
 from .basis.rows import Rows
-from .basis.target import Fit, check_room
+from .basis.target import Fit, Target, check_room
+from .basis.total import carrier, fit_total
 from .directions import parse_directions
 from .errors import SettingsError
+from .indirect import IndirectTransport, direct_report, surface_shares
 from .memory import free_bytes, parse_bytes, resident_bytes
 from .parallel import BLOCK_ROWS, map_chunks
 from .points.points import POINT_FIELDS, sample_points
 from .provenance import describe_scene
-from .room import Room, held_coefficient_bytes
+from .room import INDIRECT_LANE_BYTES, LANE_BYTES, Room, held_coefficient_bytes
 from .runtime import count_kernels, peak_memory_bytes, versions
 from .scene.scene import open_scene
 from .settings import Settings
 from .transport.direct import DirectSampler, find_buried
+from .transport.hops import blocked_share
 from .workspace import durable, temporary
 
+STRICTER = 0.99  # margin of a second fit, for what is lost beside direct transport
 OPEN_KEYS = ("coefficients", "variance")  # what may be chosen anew when the fit could not give what was asked for
 
 
@@ -96,13 +101,13 @@ def measure(scene, parameters=None, progress=None, output=None, resume=False, ma
         with temporary() if output is None else durable(output, run, resume, OPEN_KEYS) as workspace:
             sampler = DirectSampler(scene, points, directions, settings.rays_per_direction, room.lanes)
             with closing(workspace.rows("visibility", len(points), sampler.row_bytes)) as bits:
-                _sample(sampler, bits, room.lanes, progress)
+                _trace("transport", sampler, bits, progress)
                 transport = sampler.transport(bits)
                 dark = transport.dark()
                 buried = find_buried(scene, points, dark, room.lanes)
                 clock.lap("transport")
-                fit, coefficients = _compress(transport, directions, buried, settings, target, room, workspace, run, progress)
-                clock.lap("basis")
+                job = _Compression(scene, points, directions, settings, target, room, workspace, run, progress)
+                fit, coefficients, reflections = job.run(transport, buried, clock)
             asset = Asset(
                 points,
                 buried,
@@ -118,6 +123,7 @@ def measure(scene, parameters=None, progress=None, output=None, resume=False, ma
                     "buried_points": int(buried.sum()),
                     "captured_variance": fit.captured_variance,
                     "relative_error": fit.relative_error,
+                    **reflections,
                 },
             )
             if output is not None:
@@ -140,63 +146,114 @@ def _identity(settings, scene, points):
     return {"scene": digest.hexdigest()[:16], "points": len(points), **asdict(settings), "versions": versions()}
 
 
-def _sample(sampler, bits, lanes, progress):
-    """Trace what of the transport is not there yet."""
-    per_block = max(1, lanes // sampler.rays_per_point)
-    total = -(-bits.count // per_block)
+def _trace(stage, sampler, rows, progress):
+    """Trace what of a sampler's rows is not there yet."""
     started, traced = time.perf_counter(), 0
-    progress("transport", total - -(-(bits.count - bits.filled) // per_block), total, "")
-    for block in sampler.blocks(bits.filled):
-        bits.append(block)
+    progress(stage, rows.filled, rows.count, "")
+    for block in sampler.blocks(rows.filled):
+        rows.append(block)
         traced += len(block) * sampler.rays_per_point
         rate = traced / max(time.perf_counter() - started, 1e-9)
-        progress("transport", total - -(-(bits.count - bits.filled) // per_block), total, f"{rate / 1e6:.1f} million rays/s")
+        progress(stage, rows.filled, rows.count, f"{rate / 1e6:.1f} million rays/s")
 
 
-def _compress(transport, directions, buried, settings, target, room, workspace, run, progress):
-    """Fit the basis to the points that are not buried (they would only pull it), then encode all points."""
-    n, _ = transport.shape
-    if settings.basis == "none":
-        basis = NoBasis(directions.solid_angles.astype(np.float32))
-        return Fit(basis, 1.0, 0.0), transport.in_memory()
-    kept = np.flatnonzero(~buried) if not buried.all() else np.arange(n)
-    try:
-        fit = fit_basis(
-            settings.basis,
-            Rows(transport.rows, kept, directions),
-            target,
-            settings.seed,
-            lambda *done: progress("basis", *done, ""),
-            room.basis,
-            workspace.keep,
-        )
-        if settings.coefficients not in (None, "auto") and len(fit.basis) < settings.coefficients:
-            raise SettingsError(
-                f"{settings.coefficients} coefficients are above the rank of the transport: at most {len(fit.basis)}"
+@dataclass(frozen=True, eq=False)
+class _Compression:
+    """From sampled transport to a basis and coefficients."""
+
+    scene: object
+    points: object
+    directions: object
+    settings: Settings
+    target: object
+    room: Room
+    workspace: object
+    identity: dict
+    progress: Callable
+
+    def run(self, transport, buried, clock):
+        """Fit, coefficients and what is told of reflections."""
+        settings = self.settings
+        kept = ~buried if not buried.all() else ~np.zeros_like(buried)  # buried points would only pull the basis
+        blocked = blocked_share(transport, self.directions.solid_angles)
+        report = direct_report(float((1 - blocked) @ surface_shares(self.points, buried)))
+        if settings.basis == "none":
+            basis = NoBasis(self.directions.solid_angles.astype(np.float32))
+            return Fit(basis, 0.0, 1.0, 1.0), transport.in_memory(), report
+        fit = self._fit(transport, kept, self.target)
+        clock.lap("basis")
+        if settings.bounces != 0 and (blocked[kept] > 0).any():
+            total = self._with_reflections(fit, transport, buried, blocked, kept)
+            clock.lap("indirect")
+            if total is not None:
+                return total
+        coefficients = self._encode(fit.basis, transport)
+        clock.lap("coefficients")
+        return fit, coefficients, report
+
+    def _with_reflections(self, fit, transport, buried, blocked, kept):
+        """Fit, coefficients and report of total transport; None where no light is reflected to any point."""
+        while True:
+            span = carrier(fit.basis)
+            direct = self._encode(span, transport)
+            lanes = max(1, self.room.lanes * LANE_BYTES // INDIRECT_LANE_BYTES)
+            indirect = IndirectTransport(
+                self.scene, self.points, buried, transport, self.directions, self.settings, span, direct, blocked, lanes
             )
-        if target.components is None:
-            size = held_coefficient_bytes(settings.basis, *transport.shape, len(fit.basis))
-            check_room(f"keeping {len(fit.basis):,} coefficients of {n:,} points", size, room.basis)
-    except SettingsError as error:
-        if not workspace.lasting:
-            raise
-        # Only the fit could tell. The rays are kept for another choice of coefficients, or more memory; the passes of this fit
-        # are not, because another one may start elsewhere.
-        workspace.forget_arrays()
-        workspace.record({key: value for key, value in run.items() if key not in OPEN_KEYS})
-        raise SettingsError(f"all rays are traced and kept, resume (--resume) goes on from them, but {error}") from None
-    return fit, _encode(fit.basis, transport, progress)
+            coefficients, report = indirect.coefficients(
+                indirect.demand(), self.workspace, lambda *job: _trace(*job, self.progress), self.progress
+            )
+            if coefficients is None:
+                return None
+            total, coefficients = fit_total(fit, self.target, span, direct, coefficients, kept)
+            wanted = self.target.variance
+            if wanted is None or total.captured_variance >= wanted:
+                return total, coefficients, report
+            # Reflections make transport vary less: direct transport has to be compressed with less loss.
+            before, share = fit, 1 - STRICTER * (1 - wanted) * total.variance / (report["channels"] * fit.variance)
+            fit = self._fit(transport, kept, Target(variance=share))
+            if len(fit.basis) <= len(before.basis):
+                raise SettingsError(f"no number of coefficients captures {wanted:g} of the variance of total transport: ask for less")
 
+    def _fit(self, transport, kept, target):
+        """The basis of direct transport."""
+        settings, workspace = self.settings, self.workspace
+        try:
+            fit = fit_basis(
+                settings.basis,
+                Rows(transport.rows, np.flatnonzero(kept), self.directions),
+                target,
+                settings.seed,
+                lambda *done: self.progress("basis", *done, ""),
+                self.room.basis,
+                workspace.keep,
+            )
+            if settings.coefficients not in (None, "auto") and len(fit.basis) < settings.coefficients:
+                raise SettingsError(
+                    f"{settings.coefficients} coefficients are above the rank of the transport: at most {len(fit.basis)}"
+                )
+            if target.components is None:
+                size = held_coefficient_bytes(settings, *transport.shape, len(fit.basis), self.room.channels)
+                check_room(f"keeping {len(fit.basis):,} coefficients of {len(kept):,} points", size, self.room.basis)
+        except SettingsError as error:
+            if not workspace.lasting:
+                raise
+            # Only the fit could tell. The rays are kept for another choice of coefficients, or more memory; the passes of this fit
+            # are not, because another one may start elsewhere.
+            workspace.forget_arrays()
+            workspace.record({key: value for key, value in self.identity.items() if key not in OPEN_KEYS})
+            raise SettingsError(f"all rays are traced and kept, resume (--resume) goes on from them, but {error}") from None
+        return fit
 
-def _encode(basis, transport, progress):
-    """Coefficients of all points, block by block."""
-    n, _ = transport.shape
-    starts = range(0, n, BLOCK_ROWS)
-    blocks = []
-    for block in map_chunks(lambda first: basis.encode(transport.rows(slice(first, first + BLOCK_ROWS))), starts):
-        blocks.append(block)
-        progress("coefficients", min(len(blocks) * BLOCK_ROWS, n), n, "")
-    return scipy.sparse.vstack(blocks, format="csr") if scipy.sparse.issparse(blocks[0]) else np.concatenate(blocks)
+    def _encode(self, basis, transport):
+        """Coefficients of all points, block by block."""
+        n, _ = transport.shape
+        starts = range(0, n, BLOCK_ROWS)
+        blocks = []
+        for block in map_chunks(lambda first: basis.encode(transport.rows(slice(first, first + BLOCK_ROWS))), starts):
+            blocks.append(block)
+            self.progress("coefficients", min(len(blocks) * BLOCK_ROWS, n), n, "")
+        return scipy.sparse.vstack(blocks, format="csr") if scipy.sparse.issparse(blocks[0]) else np.concatenate(blocks)
 
 
 class _Clock:

@@ -115,13 +115,12 @@ def relight_to_file(
 
 def _local_light_error(asset, lights, nearest, opened, scene):
     """The entry local_light_error, or none where the scene is neither open nor needed, or not to be had."""
-    if opened is None:
-        warning = hull_warning(lights, asset.points.hull)
-        if not warning:
-            return {}
-        try:
-            opened = open_scene_of(asset, scene)
-        except SceneError as error:
-            warnings.warn(f"{warning}; by how much it errs cannot be measured: {error}", LightWarning, stacklevel=3)
-            return {}
-    return {"local_light_error": measure_error(asset, lights, nearest, opened)}
+    warning = hull_warning(lights, asset.points.hull)
+    if opened is None and not warning:
+        return {}
+    try:
+        return {"local_light_error": measure_error(asset, lights, nearest, opened or open_scene_of(asset, scene))}
+    except SceneError as error:
+        warning = f"{warning}; by" if warning else "local lights: by"
+        warnings.warn(f"{warning} how much it errs cannot be measured: {error}", LightWarning, stacklevel=3)
+        return {}

@@ -1,21 +1,47 @@
 """What a precomputation takes of memory, told before it starts."""
 
+import numpy as np
+
 from .basis.bases import coefficient_bytes, fit_bytes
 from .errors import SettingsError
+from .indirect import GREY
 from .memory import resident_bytes
 from .parallel import BLOCK_ROWS
 from .runtime import thread_count
 from .transport.direct import LANES
+from .transport.interreflection import COLUMNS
 
 LANE_BYTES = 40  # of a wavefront, for each of its rays
 LEAST_LANES = 1 << 16
 POINT_BYTES = 240  # for each point, what the ray tracer and the fit hold of it beside the points themselves
+INDIRECT_LANE_BYTES = 400  # the same of rays that are followed to surfaces, with what they bring back
+SUMMED_TERMS, SOLVED_TERMS = 3, 9  # vectors that a series, and a Krylov method, work on at a time
 COPIES = {"haar": 3.2}  # of the stored coefficients in memory, where blocks are put together: indices are wider there; else 2
 
 
-def held_coefficient_bytes(basis, points, directions, components, rays_per_direction=1):
-    """Memory that the coefficients of all points take while they are put together."""
-    return int(COPIES.get(basis, 2) * coefficient_bytes(basis, points, directions, components, rays_per_direction))
+def held_coefficient_bytes(settings, points, directions, components, channels):
+    """Memory that the coefficients of all points take while they are put together.
+
+    Parameters
+    ----------
+    settings : Settings
+    points, directions, components : int
+    channels : 1 or 3
+        Of total transport; see `expected_channels`.
+    """
+    size = coefficient_bytes(settings.basis, points, directions, components, settings.rays_per_direction)
+    held = COPIES.get(settings.basis, 2) * size
+    if settings.bounces != 0:
+        # Direct transport; two estimates of indirect transport, and their difference or the rows they come from; what is summed of
+        # some columns.
+        columns = 4 * points * channels * (SUMMED_TERMS if settings.bounces != "auto" else SOLVED_TERMS) * min(COLUMNS, components + 1)
+        held = size + (3 if settings.indirect == "solve" else 4) * size * channels + columns
+    return int(held)
+
+
+def expected_channels(points, settings):
+    """Colour channels of total transport, as the points' own albedo tells."""
+    return 3 if settings.bounces != 0 and np.ptp(points.albedo, axis=1).max(initial=0) > GREY else 1
 
 
 class Room:
@@ -36,6 +62,8 @@ class Room:
     ----------
     lanes : int
         Rays of a wavefront.
+    channels : 1 or 3
+        Colour channels that total transport is expected to have.
     basis : int
         Bytes that fitting a basis may take beside the coefficients.
 
@@ -50,8 +78,9 @@ class Room:
         held = resident_bytes()
         n, s, rays = len(points), len(directions), settings.rays_per_direction
         components = target.components or 0
+        self.channels = expected_channels(points, settings)
         blocks = BLOCK_ROWS * s * (6 * rays + 12) * thread_count()
-        fixed = POINT_BYTES * n + blocks + held_coefficient_bytes(settings.basis, n, s, components, rays)
+        fixed = POINT_BYTES * n + blocks + held_coefficient_bytes(settings, n, s, components, self.channels)
         needed = fixed + fit_bytes(settings.basis, n, s, components) + LANE_BYTES * LEAST_LANES
         if limit - held < needed:
             raise SettingsError(

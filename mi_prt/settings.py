@@ -11,6 +11,17 @@ from .errors import SettingsError
 
 DEFAULT_VARIANCE = 0.95
 MAX_RAYS_PER_DIRECTION = 64
+MAX_BOUNCES = 10_000
+MAX_PATHS = 1 << 16
+INDIRECT = ("solve", "paths")
+DIRECT_ONLY = ("haar", "none")  # bases whose coefficients are picked from, or are, rows of direct transport
+_INTEGERS = {  # settings that are integers, and what else they may be
+    "coefficients": (None, "auto"),
+    "rays_per_direction": (),
+    "bounces": (None, "auto"),
+    "paths_per_point": ("auto",),
+    "seed": (),
+}
 
 
 @dataclass(frozen=True)
@@ -33,6 +44,18 @@ class Settings:
         Metres to which coarse faces and analytic shapes are tessellated.
     rays_per_direction : int
         Rays in each cell of the lattice, 1…64.
+    bounces : int, 'auto' or None
+        Most reflections of light on its way to a point: 0 is direct light alone, 'auto' as many as it takes until less than 0.1 % of
+        the light is left (none where no point sees another). None is 'auto', and 0 for the bases `haar` and `none`, which hold
+        direct transport only.
+    indirect : str
+        How reflections are computed: ``solve`` (one traced hop between points, and a series in coefficient space) or ``paths``
+        (path tracing from each point: unbiased, and noisier).
+    paths_per_point : int or 'auto'
+        Rays (`solve`) or paths (`paths`) from each point; 'auto' takes so many, 64…1024, that a pilot run expects their noise to be
+        below 1 % of the transport.
+    denoise : bool
+        Whether components of indirect transport are scaled by the share of their variance that is signal.
     seed : int
 
     Raises
@@ -47,13 +70,17 @@ class Settings:
     variance: float | None = None
     edge_length: str | float = "auto"
     rays_per_direction: int = 1
+    bounces: int | str | None = None
+    indirect: str = "solve"
+    paths_per_point: int | str = "auto"
+    denoise: bool = True
     seed: int = 0
 
     def __post_init__(self):
         lattice = parse_directions(self.directions)
         plain = {"directions": str(lattice)}
         check_basis(self.basis)
-        for name, others in (("coefficients", (None, "auto")), ("rays_per_direction", ()), ("seed", ())):
+        for name, others in _INTEGERS.items():
             value = getattr(self, name)
             if any(value is other or (isinstance(value, str) and value == other) for other in others):
                 continue
@@ -72,6 +99,25 @@ class Settings:
         if self.seed < 0:
             raise SettingsError(f"seed must be ≥ 0, got {self.seed}")
         self._check_coefficients(lattice)
+        self._check_bounces()
+
+    def _check_bounces(self):
+        if self.bounces is None:
+            object.__setattr__(self, "bounces", 0 if self.basis in DIRECT_ONLY else "auto")
+        if self.bounces != "auto" and not 0 <= self.bounces <= MAX_BOUNCES:
+            raise SettingsError(f"bounces must be auto or 0…{MAX_BOUNCES}, got {self.bounces}")
+        if self.bounces != 0 and self.basis in DIRECT_ONLY:
+            raise SettingsError(
+                f"the basis {self.basis} holds direct transport only, got bounces {self.bounces}: use bounces 0, or the basis pca, sh or "
+                "haar-shared"
+            )
+        if self.indirect not in INDIRECT:
+            raise SettingsError(f"indirect '{self.indirect}' is not known: use {' or '.join(INDIRECT)}")
+        if not isinstance(self.denoise, bool):
+            raise SettingsError(f"denoise must be true or false, got {self.denoise!r}")
+        paths = self.paths_per_point
+        if paths != "auto" and (not 2 <= paths <= MAX_PATHS or paths % 2):
+            raise SettingsError(f"paths per point must be auto or an even number 2…{MAX_PATHS:,}, got {paths}")
 
     def _check_coefficients(self, lattice):
         if self.basis == "none" and self.coefficients is not None:

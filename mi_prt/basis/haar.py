@@ -21,7 +21,7 @@ from ..errors import SettingsError
 from .basis import Basis
 from .linear import LinearBasis
 from .rows import Rows
-from .target import Fit, Target, centred, check_room, fit_of, shares
+from .target import Fit, Target, centred, check_room, shares
 
 FIT_BYTES = 12  # for each wavelet of a shared set and direction: as a function, weighted, and to encode with
 
@@ -252,7 +252,7 @@ def fit_haar(rows: Rows, target: Target, seed=0, progress=lambda done, total: No
     progress(1, 1)
     components, residual = _fewest(target, energies, variance)
     basis = HaarBasis(rows.sqrt_weights, shares(energies[:components], variance))
-    return fit_of(basis, residual, variance, energies.sum())
+    return Fit(basis, residual, variance, energies.sum())
 
 
 def fit_haar_shared(rows: Rows, target: Target, seed=0, progress=lambda done, total: None, max_bytes=inf) -> Fit:
@@ -281,7 +281,7 @@ def fit_haar_shared(rows: Rows, target: Target, seed=0, progress=lambda done, to
         rows.sqrt_weights,
         shares(energies[chosen], variance),
     )
-    return fit_of(basis, residual, variance, energies.sum())
+    return Fit(basis, residual, variance, energies.sum())
 
 
 def _energies(rows, ranked):

@@ -12,7 +12,7 @@ from ..lighting.environment import rotation_matrix
 from ..lighting.light import Light
 from .linear import LinearBasis
 from .rows import Rows
-from .target import Fit, Target, centred, check_room, fit_of, shares
+from .target import Fit, Target, centred, check_room, shares
 
 MAX_BANDS = 33  # 1,089 functions: far beyond what low-frequency light needs, and cheap to turn still
 FIRST_BANDS = 10  # where a search for a share of the variance starts
@@ -258,7 +258,7 @@ def fit_harmonics(rows: Rows, target: Target, seed=0, progress=lambda done, tota
             bands = 1 + int(np.argmax(enough))
             break
         if bands == most:
-            captured = fit_of(None, residuals[-1], variance, energy).captured_variance
+            captured = Fit(None, residuals[-1], variance, energy).captured_variance
             raise SettingsError(
                 f"spherical harmonics do not capture {target.variance} of the variance: the {bands**2:,} that "
                 f"{rows.directions} allows capture {captured:.6g}; ask for less, or for another basis"
@@ -271,7 +271,7 @@ def fit_harmonics(rows: Rows, target: Target, seed=0, progress=lambda done, tota
         rows.sqrt_weights,
         shares(energies[: bands**2], variance),
     )
-    return fit_of(basis, residuals[bands - 1], variance, energy)
+    return Fit(basis, residuals[bands - 1], variance, energy)
 
 
 def _energies(rows, functions, gram):

@@ -19,7 +19,7 @@ import scipy.linalg
 from ..parallel import map_chunks, one_blas_thread
 from .linear import LinearBasis
 from .rows import Rows
-from .target import Fit, Target, check_room, fit_of
+from .target import Fit, Target, check_room
 
 OVERSAMPLING = 16
 SAMPLE_ITERATIONS = 2  # power iterations on a quarter of the rows, which find nearly the subspace of all
@@ -49,7 +49,7 @@ class PCA(LinearBasis):
         It drops the part of the mean transport outside the span of the basis (erratum 1).
         """
         compensated = coefficients + self._encoder[1]
-        return compensated @ (self.vectors @ (radiance * self.sqrt_weights[:, None]))
+        return compensated @ self.project_light(radiance)[0]
 
 
 def compute_anew(name, compute):
@@ -108,12 +108,12 @@ def fit_pca(
     if target.variance is not None and enough:
         values = values[: 1 + int(np.searchsorted(np.cumsum(values), target.variance * variance))]
     basis = PCA(
-        np.ascontiguousarray(_fixed_signs(vectors[:, : len(values)]).T, dtype=np.float32),
+        np.ascontiguousarray(fixed_signs(vectors[:, : len(values)]).T, dtype=np.float32),
         (mean / rows.sqrt_weights).astype(np.float32),
         rows.sqrt_weights,
         values / variance if variance > 0 else values,
     )
-    return fit_of(basis, max(variance - values.sum(), 0.0), variance, squares)
+    return Fit(basis, max(variance - values.sum(), 0.0), variance, squares)
 
 
 def _unpacked(moments):
@@ -254,7 +254,7 @@ def _exact(rows, mean, components, progress):
         return values, matrix.T @ left / np.maximum(np.sqrt(values), 1e-300)
 
 
-def _fixed_signs(vectors):
+def fixed_signs(vectors):
     """Make each vector's largest entry positive, so that the same data give the same basis."""
     largest = np.abs(vectors).argmax(axis=0)
     return vectors * np.where(vectors[largest, np.arange(vectors.shape[1])] < 0, -1, 1)

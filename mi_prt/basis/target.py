@@ -53,37 +53,32 @@ class Fit:
 
     Parameters
     ----------
-    basis : LinearBasis or HaarBasis
-    captured_variance : float
-        1 − Σ‖T − T̂‖² / Σ‖T − mean‖², T̂ the reconstruction. Negative where a basis without a mean does worse than the
-        mean alone. Where nothing varies: 1 if nothing is lost, else 0.
-    relative_error : float
-        ‖T − T̂‖ / ‖T‖ over all rows; 0 where all are zero.
-    """
-
-    basis: object
-    captured_variance: float
-    relative_error: float
-
-
-def fit_of(basis, residual, variance, energy):
-    """A Fit from sums over the fitted rows.
-
-    Parameters
-    ----------
-    basis : LinearBasis or HaarBasis
+    basis : a basis of `basis.bases.BASES`
     residual : float
-        Σ‖T − T̂‖².
+        Σ‖T − T̂‖², T̂ the reconstruction.
     variance : float
         Σ‖T − mean‖², see `centred`.
     energy : float
         Σ‖T‖².
     """
-    if variance > ROUNDING * energy:
-        captured = 1 - residual / variance
-    else:
-        captured = float(residual <= ROUNDING * energy)
-    return Fit(basis, float(captured), float(np.sqrt(residual / energy)) if energy else 0.0)
+
+    basis: object
+    residual: float
+    variance: float
+    energy: float
+
+    @property
+    def captured_variance(self):
+        """1 − Σ‖T − T̂‖²/Σ‖T − mean‖². Negative where a basis without a mean does worse than the mean alone. Where nothing varies: 1 if
+        nothing is lost, else 0."""
+        if self.variance > ROUNDING * self.energy:
+            return float(1 - self.residual / self.variance)
+        return float(self.residual <= ROUNDING * self.energy)
+
+    @property
+    def relative_error(self):
+        """‖T − T̂‖/‖T‖ over all rows; 0 where all are zero."""
+        return float(np.sqrt(self.residual / self.energy)) if self.energy else 0.0
 
 
 def centred(energy, total, count):

@@ -17,6 +17,7 @@ from .report import write_report
 REFERENCES = ("modelled", "full")
 COMPARED_POINTS = 4096
 POINT_SAMPLES = 4096  # samples of the emitters at each compared point
+POINT_PATHS = 1024  # paths from each compared point, where light is reflected
 IMAGE_SAMPLES = 64  # samples per pixel of the asset's own image: it has no noise but that of antialiasing
 
 
@@ -89,11 +90,12 @@ def compare(
     progress("reference at the points", 1, 3)
     started = time.perf_counter()
     chosen = np.sort(np.random.default_rng(seed).permutation(len(asset.points))[:COMPARED_POINTS])
-    at_points = ground_truth.point_irradiance(truth, asset.points.at(chosen), POINT_SAMPLES, seed)
+    bounces = asset.reference_bounces
+    at_points = ground_truth.irradiance(truth, asset.points.at(chosen), POINT_SAMPLES, POINT_PATHS, bounces, seed)
 
     progress("reference image", 2, 3)
     with resized(pick_sensor(truth, sensor), size) as camera:
-        expected = ground_truth.image(truth, camera, spp, seed)
+        expected = ground_truth.image(truth, camera, spp, seed, ground_truth.path_depth(bounces))
         seconds["reference"] = time.perf_counter() - started
         result = render_image(asset, truth, camera, IMAGE_SAMPLES, seed, irradiance)
         covered = coverage(truth, camera, IMAGE_SAMPLES, seed) > 1 - 1e-4
@@ -107,6 +109,10 @@ def compare(
         "basis": asset.basis.kind,
         "coefficients": len(asset.basis),
         "directions": len(asset.directions),
+        "bounces": asset.report["bounces"],
+        "reference_bounces": "any number" if bounces is None else bounces,
+        "bounce_energy_left": asset.report.get("bounce_energy_left", 0.0),
+        "indirect_noise": asset.report.get("indirect_noise", 0.0),
         "captured_variance": asset.report["captured_variance"],
         "points": {"count": len(chosen)} | _errors(irradiance[chosen], at_points),
         "image": _image_errors(result, expected, covered),

@@ -82,6 +82,68 @@ def point_irradiance(mi_scene, points, spp, seed=0):
     return Reference(means, errors)
 
 
+def irradiance(mi_scene, points, spp, paths, bounces=None, seed=0):
+    """Irradiance at points, direct and after reflections; see `point_irradiance` and `indirect_irradiance`."""
+    direct = point_irradiance(mi_scene, points, spp, seed)
+    indirect = indirect_irradiance(mi_scene, points, paths, bounces, seed)
+    return Reference(direct.mean + indirect.mean, np.hypot(direct.standard_error, indirect.standard_error))
+
+
+def path_depth(bounces):
+    """Mitsuba's `max_depth` for images of light after so many reflections on its way to what is seen; None is any number."""
+    return -1 if bounces is None else bounces + 2
+
+
+def indirect_irradiance(mi_scene, points, spp, bounces=None, seed=0):
+    """Irradiance at points after one reflection and more, by Mitsuba's path tracer along cosine-distributed rays.
+
+    Parameters
+    ----------
+    mi_scene : mi.Scene
+    points : Points
+    spp : int
+        Paths from each point, rounded up to an even number.
+    bounces : int or None
+        Most reflections; None for any number (with Mitsuba's own Russian roulette).
+    seed : int
+
+    Returns
+    -------
+    Reference
+        mean and standard_error (n, 3) in W/m². The error is told from all paths of a point.
+    """
+    import drjit as dr
+
+    mi = mitsuba()
+    spp += spp % 2
+    count = len(points)
+    means, errors = np.zeros((count, 3)), np.zeros((count, 3))
+    if bounces == 0:
+        return Reference(means, errors)
+    # From the point on: one reflection less is on the way to what is seen from there.
+    depth = path_depth(None if bounces is None else bounces - 1)
+    integrator = mi.load_dict({"type": "path", "max_depth": depth, "hide_emitters": True})
+    step = max(1, LANES // spp)
+    sampler = mi.load_dict({"type": "independent"})
+    per_point = dr.opaque(mi.UInt32, spp)
+    interaction = _interactions(mi_scene, points)
+    for block, first in enumerate(range(0, count, step)):
+        size = min(step, count - first)
+        sampler.seed(seed + block * 7919, size * spp)
+        lane = dr.arange(mi.UInt32, size * spp)
+        si = interaction(lane // per_point + dr.opaque(mi.UInt32, first))
+        direction = si.sh_frame.to_world(mi.warp.square_to_cosine_hemisphere(sampler.next_2d()))
+        radiance = integrator.sample(mi_scene, sampler, mi.RayDifferential3f(si.spawn_ray(direction)))[0]
+        value = mi.Color3f(radiance) * dr.pi
+        sums = [dr.block_sum(channel, spp) for channel in value]
+        squares = [dr.block_sum(channel * channel, spp) for channel in value]
+        dr.eval(sums, squares)
+        mean, square = (np.stack([np.array(x, dtype=np.float64) for x in y], axis=-1) / spp for y in (sums, squares))
+        means[first : first + size] = mean
+        errors[first : first + size] = np.sqrt(np.maximum(square - mean**2, 0) / (spp - 1))
+    return Reference(means, errors)
+
+
 def local_irradiance(mi_scene, points, lights):
     """Irradiance at points under local lights by Mitsuba's emitters and shadow rays, one light at a time: without noise.
 
@@ -148,7 +210,7 @@ def image(mi_scene, sensor, spp, seed=0, max_depth=2):
         Samples per pixel, split over two renders whose difference tells the noise.
     seed : int
     max_depth : int
-        2 is direct light.
+        See `path_depth`; 2 is direct light.
 
     Returns
     -------

@@ -5,10 +5,13 @@ import warnings
 import numpy as np
 
 from ..lighting.environment import LightWarning
+from ..lighting.light import Light
 from ..lighting.local import hull_warning
+from ..lighting.scene_light import lit_scene
 from . import ground_truth, metrics
 
 MEASURED_POINTS = 4096
+MEASURED_PATHS = 128  # from each of them, where light is reflected
 
 
 def measure_error(asset, lights, nearest, scene, seed=0):
@@ -30,6 +33,11 @@ def measure_error(asset, lights, nearest, scene, seed=0):
     dict
         relative_rmse and bias (signed, relative) of the irradiance against Mitsuba's at `points` points, 4,096 at most.
 
+    Raises
+    ------
+    SceneError
+        If the transport holds reflections, and the scene cannot be rebuilt with the materials that it models.
+
     Warns
     -----
     LightWarning
@@ -37,7 +45,11 @@ def measure_error(asset, lights, nearest, scene, seed=0):
     """
     chosen = np.sort(np.random.default_rng(seed).permutation(len(asset.points))[:MEASURED_POINTS])
     irradiance = asset.local_irradiance(lights, nearest)
-    truth = ground_truth.local_irradiance(scene.occluders, asset.points.at(chosen), lights)
+    points = asset.points.at(chosen)
+    truth = ground_truth.local_irradiance(scene.occluders, points, lights)
+    if asset.settings["bounces"] != 0:
+        lit = lit_scene(scene.modelled(), Light(point_lights=tuple(lights)))
+        truth += ground_truth.indirect_irradiance(lit, points, MEASURED_PATHS, asset.reference_bounces, seed).mean
     error = {
         "relative_rmse": metrics.relative_rmse(irradiance[chosen], truth),
         "bias": metrics.relative_bias(irradiance[chosen], truth),

@@ -129,6 +129,12 @@ def _causes(report):
             f"Local lights: {local['relative_rmse']:.1%} relative RMSE and {local['bias']:+.1%} bias by themselves. They are seen through "
             "the nearest directions of the lattice, and where they stand inside the scene's convex hull, with visibility to infinity."
         )
+    if report["bounces"] != 0:
+        noise = f"noise {report['indirect_noise']:.2%} of the transport" if report["indirect_noise"] else "without noise"
+        yield (
+            f"Reflections: {noise} (more --paths-per-point lower it); light of the last ones left out is at most "
+            f"{report['bounce_energy_left']:.2%} of the direct light of an open sky."
+        )
     yield (
         f"Directions: light and shadows are averaged over cells of "
         f"{np.degrees(np.sqrt(4 * np.pi / report['directions'])):.1f}°, which blurs the shadow of a small sun."

@@ -14,6 +14,7 @@ from .tessellate import TESSELLATED_SHAPES, patch_levels, tessellate
 POINT_FIELDS = ("positions", "normals", "geometric_normals", "albedo", "insets", "areas", "uv", "surface")
 POINT_BUDGET = 40_000  # points that `auto` edge length aims at, beyond the meshes' own vertices
 MAX_POINTS = 4_000_000
+DIPPING_DEGREES = 1.0  # between a point's normal and its faces', above which its hemisphere counts as dipping below them
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +40,8 @@ class Points:
     surfaces : tuple of dict
         name, kind, signature, flipped, first_patch and patches (their number) of each surface of the scene.
     report : dict
-        What was irregular: counts of degenerate faces, zero and flipped normals, back sides; edge length in metres.
+        What was irregular: counts of degenerate faces, zero and flipped normals, back sides, and points whose smooth normal is
+        more than 1° off the mean of their faces, so that its hemisphere dips below them; edge length in metres.
     """
 
     positions: np.ndarray
@@ -131,13 +133,14 @@ def sample_points(scene, edge_length="auto"):
     levels = np.concatenate(levels).astype(np.int32)
     sizes = node_count(levels[:, 0].astype(np.int64), levels[:, 1].astype(np.int64))
     joined = {name: np.concatenate(values) for name, values in columns.items()}
+    off = np.sum(joined["normals"] * joined["geometric_normals"], axis=1) < np.cos(np.radians(DIPPING_DEGREES))
     return Points(
         **{name: values.astype(np.int32 if name == "surface" else np.float32) for name, values in joined.items()},
         patches=Patches(
             levels, np.cumsum(sizes) - sizes, np.concatenate(nodes).astype(np.int32), np.concatenate(backs).astype(np.int32)
         ),
         surfaces=tuple(surfaces),
-        report={"edge_length": length, **counts},
+        report={"edge_length": length, **counts, "dipping_hemispheres": int(off.sum())},
     )
 
 

@@ -10,6 +10,7 @@ from ..errors import InputError, SettingsError
 from ..lighting.scene_light import scene_light
 from ..points.locate import PatchLocator
 from ..runtime import VARIANTS, mitsuba
+from ..scene.materials import reflectance_at
 from ..scene.scene import Scene, SceneSource
 
 
@@ -100,7 +101,7 @@ def _plugin_class(variant):
             usable = sum_kept > 1e-4
             shares = [dr.select(usable, k / sum_kept, w) for k, w in zip(kept, weights)]
             irradiance = sum(w * dr.gather(mi.Color3f, self._irradiance, p, found) for p, w in zip(points, shares))
-            albedo = self._albedo(si, found)
+            albedo = reflectance_at(si, self._wrapped.surfaces, found)
             radiance = dr.select(found, albedo * irradiance / dr.pi, 0)
 
             # --- light that is seen directly
@@ -132,13 +133,6 @@ def _plugin_class(variant):
 
             _, pi, si, _ = dr.while_loop((ray, pi, si, lamp), lambda ray, pi, si, lamp: lamp, pass_through)
             return pi, si
-
-        def _albedo(self, si, active):
-            """Diffuse reflectance at hits, from the modelled material of each surface."""
-            bsdf = si.bsdf()
-            for material in dict.fromkeys(s.material for s in self._wrapped.surfaces if s.material.left_out):
-                bsdf = dr.select(bsdf == mi.BSDFPtr(material.bsdf), mi.BSDFPtr(material.modelled), bsdf)
-            return bsdf.eval_diffuse_reflectance(si, active)
 
         def to_string(self):
             return f"PRTIntegrator[filename={self.asset.path}, points={len(self.asset.points)}]"

@@ -82,6 +82,30 @@ def model_material(bsdf):
     return Material(bsdf, modelled, two_sided, textured, tuple(dict.fromkeys(left_out)))
 
 
+def reflectance_at(si, surfaces, active=True):
+    """Diffuse reflectance (mi.Color3f) at hits, from the modelled material of each surface.
+
+    Parameters
+    ----------
+    si : mi.SurfaceInteraction3f
+    surfaces : sequence of Surface
+        Those of the scene that was hit.
+    active : mi.Bool
+    """
+    return mitsuba().Color3f(modelled_bsdf(si, surfaces).eval_diffuse_reflectance(si, active))
+
+
+def modelled_bsdf(si, surfaces):
+    """The modelled material (mi.BSDFPtr) at hits; parameters as of `reflectance_at`."""
+    import drjit as dr
+
+    mi = mitsuba()
+    bsdf = si.bsdf()
+    for material in dict.fromkeys(s.material for s in surfaces if s.material.left_out):
+        bsdf = dr.select(bsdf == mi.BSDFPtr(material.bsdf), mi.BSDFPtr(material.modelled), bsdf)
+    return bsdf
+
+
 def _model(bsdf, left_out):
     mi = mitsuba()
     kind = bsdf.class_name()

@@ -103,8 +103,17 @@ class DirectTransport:
 
     def dark(self):
         """Which points (n,) see no direction at all."""
+        return self._of_bits(lambda bits: ~bits.any(axis=1))
+
+    def open(self):
+        """Which points (n,) see all directions."""
+        rays = self.vectors.shape[0] * self.vectors.shape[1]
+        full = np.packbits(np.ones(rays, bool))
+        return self._of_bits(lambda bits: (bits == full).all(axis=1))
+
+    def _of_bits(self, function):
         step = 1 << 14
-        return np.concatenate([~self.bits[slice(i, i + step)].any(axis=1) for i in range(0, len(self.normals), step)])
+        return np.concatenate([function(self.bits[slice(i, i + step)]) for i in range(0, len(self.normals), step)])
 
 
 class DirectSampler:

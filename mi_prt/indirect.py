@@ -1,0 +1,189 @@
+"""Indirect transport: whether a scene calls for it, how many rays it takes, and what it adds to direct transport's coefficients."""
+
+from contextlib import closing
+from dataclasses import dataclass
+
+import numpy as np
+
+from .transport.hops import NOTHING, Hops, HopSampler
+from .transport.interreflection import MOST_SUMMED_BOUNCES, BounceSplit, combined, solve, split_by_bounces
+from .transport.paths import ENERGY_BINS, PathSampler
+
+PILOT_POINTS = 256
+PILOT_RAYS = 64
+NOISE_TOLERANCE = 0.01  # noise of indirect transport that `auto` aims at, as a share of the norm of direct transport
+LEAST_RAYS, MOST_RAYS = 64, 1024  # of `auto`, from each point
+GREY = 1e-3  # difference between the channels of an albedo that is taken for grey
+
+
+@dataclass(frozen=True, eq=False)
+class Demand:
+    """What a scene calls for beyond direct transport.
+
+    Parameters
+    ----------
+    rays : int
+        Rays or paths from each point.
+    channels : 1 or 3
+        1 where all that reflects is grey.
+    """
+
+    rays: int
+    channels: int
+
+
+@dataclass(frozen=True, eq=False)
+class IndirectTransport:
+    """Indirect transport of a scene's points, in the span of their direct transport.
+
+    Parameters
+    ----------
+    scene : Scene
+    points : Points
+    buried : (n,) bool
+    transport : DirectTransport
+    directions : DirectionLattice
+    settings : Settings
+    span : LinearBasis
+        Without a mean, see `basis.total.carrier`.
+    direct : (n, m) float32
+        Coefficients of direct transport in it.
+    blocked : (n,) float32
+        Share of each point's cosine-weighted hemisphere in which it sees a surface.
+    lanes : int
+        Most rays of one wavefront.
+    """
+
+    scene: object
+    points: object
+    buried: np.ndarray
+    transport: object
+    directions: object
+    settings: object
+    span: object
+    direct: np.ndarray
+    blocked: np.ndarray
+    lanes: int
+
+    def demand(self):
+        """Find out what the scene calls for, by a few rays from some of its points; a Demand."""
+        settings = self.settings
+        seeing = np.flatnonzero((self.blocked > 0) & ~self.buried)
+        few = np.sort(np.random.default_rng(settings.seed).permutation(seeing)[:PILOT_POINTS])
+        hops = self._hop_sampler(PILOT_RAYS).rows(few)
+        seen = hops["point"] != NOTHING
+        coloured = any(np.ptp(x, axis=-1).max(initial=0) > GREY for x in (self.points.albedo, hops["albedo"][seen]))
+        rays = settings.paths_per_point
+        if rays == "auto":
+            first, second = self._hop_halves(few, hops, seen) if settings.indirect == "solve" else self._path_halves(few)
+            noise = PILOT_RAYS / 4 * float(np.sum(np.square(first - second)))  # with a single ray; strata make it less
+            wanted = noise / max(NOISE_TOLERANCE**2 * float(np.sum(np.square(self.direct[few]))), 1e-300)
+            rays = 1 << int(np.ceil(np.log2(np.clip(wanted, LEAST_RAYS, MOST_RAYS))))
+        return Demand(rays, 3 if coloured else 1)
+
+    def _hop_halves(self, few, hops, seen):
+        """Coefficients (few, m) of light after one reflection, by every other ray and by the rest."""
+        arriving = np.zeros((*hops.shape, self.direct.shape[1]), np.float32)
+        arriving[seen] = self.direct[hops["point"][seen]] * hops["albedo"][seen].mean(axis=-1, keepdims=True)
+        return [self.blocked[few, None] * arriving[:, first::2].mean(axis=1) for first in (0, 1)]
+
+    def _path_halves(self, few):
+        """The same of light after all reflections, by paths."""
+        sampler = self._path_sampler(Demand(PILOT_RAYS, 1), self.points.at(few))
+        halves, _ = _unpacked(np.concatenate(list(sampler.blocks())), 1, self.direct.shape[1])
+        return halves[:, 0]
+
+    def coefficients(self, demand, workspace, trace, progress):
+        """Coefficients of indirect transport.
+
+        Parameters
+        ----------
+        demand : Demand
+        workspace : Workspace
+            Keeps the rays.
+        trace : callable(stage, sampler, rows)
+            Fills a RowFile.
+        progress : callable(stage, done, total, detail)
+
+        Returns
+        -------
+        coefficients : (c, n, m) float32 or None
+            None where no light is reflected to any point.
+        report : dict
+        """
+        halves, split = (self._solved if self.settings.indirect == "solve" else self._traced)(demand, workspace, trace, progress)
+        if split.bounces == 0:
+            return None, direct_report(split.energy[0])
+        coefficients, noise, passed = combined(halves, ~self.buried, self.settings.denoise)
+        size = float(np.linalg.norm(coefficients[:, ~self.buried])) * noise**0.5
+        total = float(np.linalg.norm(self.direct[~self.buried])) * demand.channels**0.5
+        return coefficients, {
+            "bounces": split.bounces,
+            "bounce_energy": [float(f"{x:.6g}") for x in split.energy],
+            "bounce_energy_left": split.left,
+            "channels": demand.channels,
+            "paths_per_point": demand.rays,
+            "indirect_noise": size / max(total, 1e-300),
+            "indirect_noise_passed": passed**0.5,
+        }
+
+    def _solved(self, demand, workspace, trace, progress):
+        """Two independent estimates (c, n, m) by a series of hops, None where there is no light; and the BounceSplit."""
+        sampler = self._hop_sampler(demand.rays)
+        m, channels = self.direct.shape[1], demand.channels
+        with closing(workspace.rows("hops", len(self.points), sampler.row_bytes)) as rays:
+            trace("indirect", sampler, rays)
+            hops = Hops(rays, self.blocked)
+            weights = surface_shares(self.points, self.buried)
+            split = split_by_bounces(hops, 1 - self.blocked, weights, channels, self._most)
+            if split.bounces == 0:
+                return None, split
+            bounces = None if self._most is None and split.bounces > MOST_SUMMED_BOUNCES else split.bounces
+            halves = [
+                solve(half, self.direct, channels, bounces, lambda done: progress("reflections", i * m + done, 2 * m, ""))
+                for i, half in enumerate(hops.halves())
+            ]
+        return halves, split
+
+    def _traced(self, demand, workspace, trace, progress):
+        """The same by paths."""
+        sampler = self._path_sampler(demand, self.points)
+        m = self.direct.shape[1]
+        with closing(workspace.rows(f"paths-{m}", len(self.points), sampler.row_bytes(m))) as rows:
+            trace("indirect", sampler, rows)
+            halves, energies = _unpacked(rows[:], demand.channels, m)
+        weights = surface_shares(self.points, self.buried)
+        reflected = (weights @ energies).tolist()
+        while reflected and reflected[-1] == 0:
+            reflected.pop()
+        return halves, BounceSplit((float((1 - self.blocked) @ weights), *reflected), 0.0)
+
+    @property
+    def _most(self):
+        return None if self.settings.bounces == "auto" else self.settings.bounces
+
+    def _hop_sampler(self, rays):
+        seed = self.settings.seed
+        return HopSampler(self.scene, self.points, self.buried, self.transport, self.directions, rays, seed, self.lanes)
+
+    def _path_sampler(self, demand, points):
+        seed, encode = self.settings.seed, self.span.encode
+        return PathSampler(self.scene, points, self.directions, demand.rays, self._most, demand.channels, encode, seed, self.lanes)
+
+
+def direct_report(energy):
+    """What an asset reports of reflections where there are none, given the energy of direct light (see `BounceSplit`)."""
+    return {"bounces": 0, "bounce_energy": [float(f"{energy:.6g}")], "channels": 1}
+
+
+def surface_shares(points, buried):
+    """The points' shares (n,) in a mean over the surface; buried points have none."""
+    weights = np.where(buried & ~buried.all(), 0, points.areas).astype(np.float64)
+    return weights / max(weights.sum(), 1e-300)
+
+
+def _unpacked(rows, channels, m):
+    """Coefficients (2, c, n, m) of both halves of the paths, and energies (n, 64), from the rows of `PathSampler`."""
+    rows = np.ascontiguousarray(rows).view(np.float32)
+    halves = rows[:, :-ENERGY_BINS].reshape(-1, 2, channels, m)
+    return np.ascontiguousarray(halves.transpose(1, 2, 0, 3)), rows[:, -ENERGY_BINS:]

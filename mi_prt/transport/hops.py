@@ -1,0 +1,247 @@
+"""One hop of light between points: what the blocked part of each point's hemisphere looks at.
+
+Light reaches a point x after a reflection from the directions in which x sees a surface,
+E(x) = E_direct(x) + ∫ ρ(y) E(y)/π cos θ dω, y being what is seen there. The integral is a linear operator that takes the
+irradiance of all points to irradiance after one more reflection: the paper's first extension (Eigentransport, section 8), as a
+sparse matrix. Its rows are sampled by rays into just those directions that the direct transport found blocked, so that what escapes
+and what is seen add up to the whole hemisphere: a white furnace is white without noise.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse
+
+from ..parallel import BLOCK_ROWS, map_chunks
+from ..points.locate import PatchLocator
+from ..runtime import mitsuba
+from ..scene.materials import modelled_bsdf, reflectance_at
+from .direct import LANES, RAY_OFFSET
+
+NOTHING = 0xFFFFFFFF  # in the place of a point: what is seen reflects nothing, or nothing that is known
+HOP = np.dtype([("point", "<u4"), ("albedo", "<f4", 3)])
+HOP_LANE_BYTES = 200  # of a wavefront, for each of its rays
+_PRODUCT_ROWS = 16 * BLOCK_ROWS
+_LEAST_KEPT = 1e-4  # weight of the points around a hit that are not buried, below which it counts as buried
+
+
+@dataclass(frozen=True, eq=False)
+class Hops:
+    """The sampled operator, for n points and K rays of each.
+
+    Parameters
+    ----------
+    rays : (n, 16·K) uint8, array or RowFile
+        `HOP` of each ray: the point seen, picked among the three around the hit by their weights, and the albedo of the hit.
+    blocked : (n,) float32
+        Share of each point's cosine-weighted hemisphere in which it sees a surface.
+    first, stride : int
+        Which of the rays of each point are used.
+    """
+
+    rays: object
+    blocked: np.ndarray
+    first: int = 0
+    stride: int = 1
+
+    def halves(self):
+        """Two operators of every other ray, independent of each other."""
+        return Hops(self.rays, self.blocked, 0, 2), Hops(self.rays, self.blocked, 1, 2)
+
+    def largest_albedo(self):
+        """The largest albedo, in any channel, of what is seen."""
+        def largest(first):
+            rays = self._read(first)
+            return rays["albedo"].max(axis=-1, where=(rays["point"] != NOTHING)[..., None], initial=0.0).max(initial=0.0)
+
+        return float(max(map_chunks(largest, range(0, len(self.blocked), _PRODUCT_ROWS))))
+
+    def _read(self, first):
+        rows = np.ascontiguousarray(self.rays[first : min(first + _PRODUCT_ROWS, len(self.blocked))])
+        return rows.view(HOP)[:, self.first :: self.stride]
+
+    def apply(self, irradiance):
+        """Irradiance after one more reflection.
+
+        Parameters
+        ----------
+        irradiance : (c, n, m) float32
+            For each colour channel; of what linear quantity its m numbers are does not matter.
+
+        Returns
+        -------
+        (c, n, m) float32
+        """
+        result = np.empty_like(irradiance)
+
+        def product(first):
+            rays = self._read(first)
+            seen = rays["point"] != NOTHING
+            ends = np.concatenate([[0], np.cumsum(seen.sum(axis=1))]).astype(np.int32)
+            columns = rays["point"][seen].astype(np.int32)
+            share = self.blocked[first : first + len(rays), None] / np.float32(rays.shape[1])
+            for channel, arriving in enumerate(irradiance):
+                weights = (_channel(rays["albedo"], channel, len(irradiance)) * share)[seen]
+                matrix = scipy.sparse.csr_array((weights, columns, ends), (len(rays), len(self.blocked)))
+                result[channel, first : first + len(rays)] = matrix @ arriving
+
+        for _ in map_chunks(product, range(0, len(self.blocked), _PRODUCT_ROWS)):
+            pass
+        return result
+
+
+def _channel(albedo, channel, channels):
+    """Albedo of one of three channels, or of the only one."""
+    return albedo[..., channel] if channels == 3 else albedo.mean(axis=-1)
+
+
+class HopSampler:
+    """Traces the hops of a scene's points, block by block; see `Hops`.
+
+    Parameters
+    ----------
+    scene : Scene
+    points : Points
+    buried : (n,) bool
+        Points that reflect nothing; the others around a hit take their share.
+    transport : DirectTransport
+    directions : DirectionLattice
+    rays : int
+        K, for each point.
+    seed : int
+    lanes : int
+        Most rays of one wavefront. Results do not depend on it.
+    """
+
+    def __init__(self, scene, points, buried, transport, directions, rays, seed=0, lanes=LANES):
+        mi = mitsuba()
+        self._scene, self._points, self._transport, self._seed = scene, points, transport, seed
+        self._locator = PatchLocator(scene, points)
+        self._kept = mi.Float(np.where(buried, 0.0, 1.0).astype(np.float32))
+        self._origins = mi.Float(points.ray_origins(RAY_OFFSET * scene.scale).ravel())
+        vectors = transport.vectors.reshape(-1, 3)
+        lengths = np.linalg.norm(vectors, axis=1)  # the share of its cell that each ray stands for
+        self._vectors = vectors / lengths[:, None]
+        half = len(directions) // 2
+        self._solid_angles = (np.tile(directions.solid_angles[:half], len(transport.vectors)) * lengths).astype(np.float32)
+        self._rays = rays
+        self._offsets = np.random.default_rng(seed).random((len(points), 1), dtype=np.float32)
+        self._lanes = lanes
+        self._step = max(1, lanes // (rays * BLOCK_ROWS)) * BLOCK_ROWS
+        self.rays_per_point = rays
+        self.row_bytes = rays * HOP.itemsize
+
+    def blocks(self, first=0):
+        """Rows (b, row_bytes) uint8 of all points from `first` on, in order."""
+        for start in range(first, len(self._points), self._step):
+            yield self.rows(np.arange(start, min(start + self._step, len(self._points)))).view(np.uint8)
+
+    def rows(self, index):
+        """Hops (b, K) of some points."""
+        # Chunks begin at the same points whatever the blocks are: how a matrix product rounds depends on its shape.
+        parts = map_chunks(self._blocked_directions, [index[i : i + BLOCK_ROWS] for i in range(0, len(index), BLOCK_ROWS)])
+        directions, active = (np.concatenate(part) for part in zip(*parts))
+        hops = np.empty((len(index), self._rays), HOP)
+        step = max(1, self._lanes // self._rays)
+        for first in range(0, len(index), step):
+            part = slice(first, first + step)
+            hops[part] = self._traced(index[part], directions[part], active[part])
+        return hops
+
+    def _blocked_directions(self, index):
+        """K blocked directions of some points (b, K, 3), stratified, in proportion to cosine times solid angle; and if there are any."""
+        cosines = self._points.normals[index] @ self._vectors.T
+        weights = np.abs(cosines) * self._solid_angles
+        weights *= np.unpackbits(self._transport.bits[index], axis=1, count=cosines.shape[1]) == 0
+        total = np.cumsum(weights, axis=1, dtype=np.float64)
+        wanted = (np.arange(self._rays) + self._offsets[index]) / self._rays * total[:, -1:]
+        # Rows one behind the other make a single ascending sequence to search in.
+        before = np.cumsum(np.append(0, total[:-1, -1]))[:, None]
+        ray = np.searchsorted((total + before).ravel(), (wanted + before).ravel(), side="right").reshape(wanted.shape)
+        ray = np.clip(ray - np.arange(len(index))[:, None] * total.shape[1], 0, total.shape[1] - 1)
+        sign = np.where(np.take_along_axis(cosines, ray, axis=1) < 0, -1, 1)
+        return (self._vectors[ray] * sign[..., None]).astype(np.float32), total[:, -1] > 0
+
+    def _traced(self, index, directions, active):
+        import drjit as dr
+
+        mi = mitsuba()
+        lanes = len(index) * self._rays
+        # Arrays go over flat and come back by component: those of other shapes compile a kernel for each size.
+        owner = mi.UInt32(np.repeat(index, self._rays).astype(np.uint32))
+        origin = dr.gather(mi.Point3f, self._origins, owner)
+        ray = mi.Ray3f(origin, dr.gather(mi.Vector3f, mi.Float(directions.ravel()), dr.arange(mi.UInt32, lanes)))
+        active = mi.Bool(np.repeat(active, self._rays))
+        pi = self._scene.occluders.ray_intersect_preliminary(ray, active=active)
+        si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
+        _, si.wi, reflects = facing(si, ray, self._scene.surfaces)
+        points, weights, found = self._locator.locate(pi, si, active & si.is_valid() & reflects)
+        kept = [w * dr.gather(mi.Float, self._kept, p, found) for p, w in zip(points, weights)]
+        total = kept[0] + kept[1] + kept[2]
+        found &= total > _LEAST_KEPT
+        # One of the three by their weights: interpolation in the mean, with a third of the entries. The number is hashed from point
+        # and ray, so that it depends on nothing else.
+        number = mi.UInt32(np.tile(np.arange(self._rays) + self._seed * self._rays, len(index)).astype(np.uint32))
+        picked = mi.sample_tea_float32(owner, number) * total
+        point = dr.select(picked < kept[0], points[0], dr.select(picked < kept[0] + kept[1], points[1], points[2]))
+        albedo = reflectance_at(si, self._scene.surfaces, found)
+        point = dr.select(found & (dr.max(albedo) > 0), point, NOTHING)
+        hops = np.empty(lanes, HOP)
+        dr.eval(point, albedo)
+        hops["point"] = np.array(point)
+        for channel, values in enumerate(albedo):
+            hops["albedo"][:, channel] = np.array(values)
+        return hops.reshape(len(index), self._rays)
+
+
+@dataclass
+class Facing:
+    """Unit normals of hits on the side that a ray comes from.
+
+    Parameters
+    ----------
+    geometric, shading : mi.Normal3f
+    """
+
+    geometric: object
+    shading: object
+
+
+def facing(si, ray, surfaces):
+    """The side of surfaces that rays meet, told by the faces and not by smooth normals.
+
+    A smooth normal can turn away from a ray that comes from the outer side of the face. Mitsuba's own materials are black there, which
+    loses energy; here such a hit reflects.
+
+    Parameters
+    ----------
+    si : mi.SurfaceInteraction3f
+    ray : mi.Ray3f
+    surfaces : sequence of Surface
+
+    Returns
+    -------
+    normals : Facing
+    wi : mi.Vector3f
+        Toward the ray's origin as a local direction, the side that is met being all that counts.
+    reflects : mi.Bool
+        Whether that side does.
+    """
+    import drjit as dr
+
+    mi = mitsuba()
+    outer = dr.mulsign(si.n, dr.dot(si.n, si.sh_frame.n))
+    side = dr.select(dr.dot(outer, ray.d) < 0, mi.Float(1), -1)
+    bsdf = modelled_bsdf(si, surfaces)
+    reflects = (side > 0) | mi.has_flag(bsdf.flags(), mi.BSDFFlags.BackSide)
+    return Facing(outer * side, si.sh_frame.n * side), mi.Vector3f(0, 0, side), reflects
+
+
+def blocked_share(transport, solid_angles):
+    """Share (n,) float32 of each point's cosine-weighted hemisphere in which it sees a surface.
+
+    It is what the visible part leaves of π, so that no energy comes from the quadrature; where every ray escapes it is zero.
+    """
+    weights = (solid_angles / np.pi).astype(np.float32)[:, None]
+    visible = (transport @ weights)[:, 0]
+    return np.where(transport.open(), 0, np.maximum(1 - visible, 0)).astype(np.float32)
