@@ -31,7 +31,10 @@ def main():
     say(f"1. precompute the transport of {SCENE.name} (once)")
     asset = mi_prt.precompute(SCENE, coefficients=128, rays_per_direction=4)
     asset.save(arguments.out / "still_life.prt")
-    say(f"   {len(asset.points):,} points, {asset.report['rays']:,} rays, {asset.report['captured_variance']:.2%} of the variance")
+    say(
+        f"   {len(asset.points):,} points, {asset.report['rays']:,} rays, {asset.report['bounces']} reflections, "
+        f"{asset.report['captured_variance']:.2%} of the variance"
+    )
 
     say("2. turn the sky around it")
     sky = arguments.out / "turning_sky.gif"

@@ -10,7 +10,10 @@ scene = {
     "ball": {"type": "sphere", "center": [0, 0, 0.4], "radius": 0.3},
 }
 asset = mi_prt.precompute(scene, directions="cubemap:16", coefficients=32)
-print(f"{len(asset.points):,} points, {asset.directions}, captured variance {asset.report['captured_variance']:.3f}")
+print(
+    f"{len(asset.points):,} points, {asset.directions}, captured variance {asset.report['captured_variance']:.3f}, "
+    f"{asset.report['bounces']} reflections: mean irradiance under a white sky {sum(asset.report['bounce_energy']):.3f} of π"
+)
 
 # A map of any size: here a bright band of sky around the horizon (+y is up in a map; this scene has +z up).
 height, width = 64, 128
@@ -20,9 +23,9 @@ light = mi_prt.EnvironmentMap(pixels).rotated(axis="x", degrees=90)
 
 irradiance = asset.irradiance(light)  # (n, 3) W/m²
 radiance = asset.relight(light)  # (n, 3) W/(m²·sr)
-row = asset.transport([0])  # (1, s): the first point's transport as the basis holds it
+row = asset.transport([0])  # (1, 3, s), or (1, s) where all is grey: the first point's transport as the basis holds it
 print("mean irradiance", irradiance.mean(axis=0), "mean outgoing radiance", radiance.mean(axis=0))
-print("transport of point 0, integrated over the sphere:", float(row[0] @ asset.directions.solid_angles))
+print("transport of point 0, integrated over the sphere:", row[0] @ asset.directions.solid_angles)
 
 # Several lights at once: a list is their sum. A local light is seen right from outside the scene's convex hull.
 sun = mi_prt.DirectionalLight(direction=[1, 0, -2], irradiance=3.0)  # travels down, W/m²

@@ -204,6 +204,8 @@ def _read(file, path):
         **{name: json.loads(file.attrs[name]) for name in _TEXTS},
     }
     channels = fields["report"]["channels"]
+    if channels not in (1, 3):
+        raise ValueError(f"transport of {channels!r} channels")
     _check_shapes(channels, **{name: fields[name] for name in ("points", "buried", "directions", "basis", "coefficients")})
     return fields
 

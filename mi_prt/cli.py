@@ -78,7 +78,7 @@ Indirect = Annotated[
     str, typer.Option("--indirect", metavar="solve|paths", help="Reflections from point to point, or by unbiased path tracing.")
 ]
 Paths = Annotated[
-    str, typer.Option("--paths-per-point", metavar="N|auto", help="Rays for reflections; auto: noise below 1 % of the transport.")
+    str, typer.Option("--paths-per-point", metavar="N|auto", help="Rays for reflections; auto: noise of about 1 % of the transport.")
 ]
 Denoise = Annotated[
     bool, typer.Option("--denoise/--no-denoise", help="Take noise that can be told out of reflected light.")

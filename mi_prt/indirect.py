@@ -1,7 +1,8 @@
 """Indirect transport: whether a scene calls for it, how many rays it takes, and what it adds to direct transport's coefficients."""
 
+import zlib
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -76,8 +77,9 @@ class IndirectTransport:
         rays = settings.paths_per_point
         if rays == "auto":
             first, second = self._hop_halves(few, hops, seen) if settings.indirect == "solve" else self._path_halves(few)
-            noise = PILOT_RAYS / 4 * float(np.sum(np.square(first - second)))  # with a single ray; strata make it less
-            wanted = noise / max(NOISE_TOLERANCE**2 * float(np.sum(np.square(self.direct[few]))), 1e-300)
+            # With a single ray from each point; strata make it less. Points that see nothing have none.
+            noise = PILOT_RAYS / 4 * float(np.sum(np.square(first - second))) / len(few) * len(seeing)
+            wanted = noise / max(NOISE_TOLERANCE**2 * float(np.sum(np.square(self.direct[~self.buried]))), 1e-300)
             rays = 1 << int(np.ceil(np.log2(np.clip(wanted, LEAST_RAYS, MOST_RAYS))))
         return Demand(rays, 3 if coloured else 1)
 
@@ -120,7 +122,7 @@ class IndirectTransport:
         return coefficients, {
             "bounces": split.bounces,
             "bounce_energy": [float(f"{x:.6g}") for x in split.energy],
-            "bounce_energy_left": split.left,
+            "bounce_energy_left": split.left if np.isfinite(split.left) else None,
             "channels": demand.channels,
             "paths_per_point": demand.rays,
             "indirect_noise": size / max(total, 1e-300),
@@ -138,18 +140,20 @@ class IndirectTransport:
             split = split_by_bounces(hops, 1 - self.blocked, weights, channels, self._most)
             if split.bounces == 0:
                 return None, split
-            bounces = None if self._most is None and split.bounces > MOST_SUMMED_BOUNCES else split.bounces
+            summed = None if self._most is None and split.bounces > MOST_SUMMED_BOUNCES else split
             halves = [
-                solve(half, self.direct, channels, bounces, lambda done: progress("reflections", i * m + done, 2 * m, ""))
+                solve(half, self.direct, channels, summed, lambda done: progress("reflections", i * m + done, 2 * m, ""))
                 for i, half in enumerate(hops.halves())
             ]
-        return halves, split
+        return halves, split if summed else replace(split, left=0.0)
 
     def _traced(self, demand, workspace, trace, progress):
         """The same by paths."""
         sampler = self._path_sampler(demand, self.points)
         m = self.direct.shape[1]
-        with closing(workspace.rows(f"paths-{m}", len(self.points), sampler.row_bytes(m))) as rows:
+        # What is kept are coefficients, which mean nothing in another span.
+        name = f"paths-{zlib.crc32(np.ascontiguousarray(self.span.vectors)):08x}"
+        with closing(workspace.rows(name, len(self.points), sampler.row_bytes(m))) as rows:
             trace("indirect", sampler, rows)
             halves, energies = _unpacked(rows[:], demand.channels, m)
         weights = surface_shares(self.points, self.buried)
@@ -185,5 +189,5 @@ def surface_shares(points, buried):
 def _unpacked(rows, channels, m):
     """Coefficients (2, c, n, m) of both halves of the paths, and energies (n, 64), from the rows of `PathSampler`."""
     rows = np.ascontiguousarray(rows).view(np.float32)
-    halves = rows[:, :-ENERGY_BINS].reshape(-1, 2, channels, m)
+    halves = rows[:, :-ENERGY_BINS].reshape(len(rows), 2, channels, m)
     return np.ascontiguousarray(halves.transpose(1, 2, 0, 3)), rows[:, -ENERGY_BINS:]

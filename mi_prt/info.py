@@ -237,7 +237,7 @@ def _reasons(settings, points, directions, coefficients, reflections):
         "indirect": "light goes from point to point, in coefficients: least noise"
         if settings.indirect == "solve"
         else "unbiased paths from each point: more noise",
-        "paths_per_point": f"so many that noise is below 1 % of the transport; the prediction takes {EXPECTED_PATHS}"
+        "paths_per_point": f"so many that noise is about 1 % of the transport; the prediction takes {EXPECTED_PATHS}"
         if settings.paths_per_point == "auto"
         else "as asked",
         "denoise": "components of reflected light keep the share of their variance that is signal"

@@ -44,8 +44,8 @@ def precompute(scene, parameters=None, progress=None, output=None, resume=False,
     parameters : dict, optional
         Values for an XML file's `<default>` parameters.
     progress : callable(stage, done, total, detail), optional
-        Called as work advances. Stages are 'transport' (in blocks of rays; the detail is rays per second), 'basis' (in passes
-        over the rows) and 'coefficients' (in points).
+        Called as work advances. Stages are 'transport' and 'indirect' (in points, whose rays are traced block by block; the detail is
+        rays per second), 'basis' (in passes over the rows), 'coefficients' (in points) and 'reflections' (in coefficients).
     output : path, optional
         File to save the asset to. What is computed on the way is kept beside it, in a folder with `.partial` behind the name,
         until the file is whole: a run that was interrupted or killed can be continued.
@@ -54,7 +54,8 @@ def precompute(scene, parameters=None, progress=None, output=None, resume=False,
     max_memory : int or str, optional
         Bytes, or such as '3G', that this process may have resident. By default what it has now and half of what is free.
     **settings
-        Fields of `Settings`: directions, basis, coefficients, variance, edge_length, rays_per_direction, seed.
+        Fields of `Settings`: directions, basis, coefficients, variance, edge_length, rays_per_direction, bounces, indirect,
+        paths_per_point, denoise, seed.
 
     Returns
     -------
@@ -140,7 +141,7 @@ def measure(scene, parameters=None, progress=None, output=None, resume=False, ma
 
 def _identity(settings, scene, points):
     """All that the result depends on: what must not change between a run and its continuation."""
-    digest = hashlib.sha256(scene.hash.encode())
+    digest = hashlib.sha256((scene.hash + scene.appearance).encode())
     for name in POINT_FIELDS:
         digest.update(np.ascontiguousarray(getattr(points, name)).tobytes())
     return {"scene": digest.hexdigest()[:16], "points": len(points), **asdict(settings), "versions": versions()}
@@ -182,7 +183,7 @@ class _Compression:
             return Fit(basis, 0.0, 1.0, 1.0), transport.in_memory(), report
         fit = self._fit(transport, kept, self.target)
         clock.lap("basis")
-        if settings.bounces != 0 and (blocked[kept] > 0).any():
+        if settings.bounces != 0 and (blocked[~buried] > 0).any():
             total = self._with_reflections(fit, transport, buried, blocked, kept)
             clock.lap("indirect")
             if total is not None:
@@ -210,7 +211,7 @@ class _Compression:
             if wanted is None or total.captured_variance >= wanted:
                 return total, coefficients, report
             # Reflections make transport vary less: direct transport has to be compressed with less loss.
-            before, share = fit, 1 - STRICTER * (1 - wanted) * total.variance / (report["channels"] * fit.variance)
+            before, share = fit, 1 - STRICTER * (1 - wanted) * total.variance / max(report["channels"] * fit.variance, 1e-300)
             fit = self._fit(transport, kept, Target(variance=share))
             if len(fit.basis) <= len(before.basis):
                 raise SettingsError(f"no number of coefficients captures {wanted:g} of the variance of total transport: ask for less")

@@ -1,20 +1,23 @@
 """The tie between an asset and the scene it came from."""
 
+import warnings
 from pathlib import Path
 
 from .errors import SceneError
+from .lighting.environment import LightWarning
 from .points.tessellate import TESSELLATED_SHAPES
 from .scene.scene import open_scene
 
 
 def describe_scene(scene):
-    """What an asset records of its scene: kind, path, parameters, hash, left_out."""
+    """What an asset records of its scene: kind, path, parameters, hash, appearance, left_out."""
     source = scene.source
     return {
         "kind": source.kind,
         "path": source.path,
         "parameters": source.parameters,
         "hash": scene.hash,
+        "appearance": scene.appearance,
         "left_out": left_out(scene),
     }
 
@@ -69,6 +72,11 @@ def open_scene_of(asset, scene=None, parameters=None):
     ------
     SceneError
         If the scene is not there any more, was given in memory, or its geometry changed.
+
+    Warns
+    -----
+    LightWarning
+        If reflected light is that of other materials.
     """
     recorded = asset.scene
     if scene is None:
@@ -83,5 +91,11 @@ def open_scene_of(asset, scene=None, parameters=None):
         raise SceneError(
             f"'{name}' is not the scene of the asset: its geometry or sidedness changed since it was precomputed; "
             "precompute it again, or pass the right one (--scene)"
+        )
+    if asset.report["bounces"] and opened.appearance != recorded["appearance"]:
+        warnings.warn(
+            "the scene's materials changed since it was precomputed: light that they reflect onto other surfaces is still that of the old ones",
+            LightWarning,
+            stacklevel=2,
         )
     return opened

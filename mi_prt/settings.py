@@ -52,8 +52,8 @@ class Settings:
         How reflections are computed: ``solve`` (one traced hop between points, and a series in coefficient space) or ``paths``
         (path tracing from each point: unbiased, and noisier).
     paths_per_point : int or 'auto'
-        Rays (`solve`) or paths (`paths`) from each point; 'auto' takes so many, 64…1024, that a pilot run expects their noise to be
-        below 1 % of the transport.
+        Rays (`solve`) or paths (`paths`) from each point; 'auto' takes so many, 64…1024, that their noise is about
+        1 % of the transport, as a pilot tells.
     denoise : bool
         Whether components of indirect transport are scaled by the share of their variance that is signal.
     seed : int

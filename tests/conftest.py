@@ -1,8 +1,18 @@
 """Small scenes and independent integrators that several test files share. Scenes are y-up, lengths in metres."""
 
-import numpy as np
+from dataclasses import dataclass
 
+import numpy as np
+import scipy.stats
+
+from mi_prt.directions import parse_directions
+from mi_prt.points.points import sample_points
 from mi_prt.runtime import mitsuba
+from mi_prt.scene.scene import open_scene
+from mi_prt.transport.direct import find_buried, sample_direct
+from mi_prt.transport.hops import NOTHING, Hops, HopSampler, blocked_share
+from mi_prt.transport.interreflection import solve, split_by_bounces
+from mi_prt.transport.paths import PathSampler
 
 
 def facing(normal, position=(0, 0, 0), size=1.0):
@@ -115,3 +125,103 @@ def relative_l2(result, reference):
 def bias(result, reference):
     """Signed, relative."""
     return float(np.sum(result, dtype=np.float64) / np.sum(reference, dtype=np.float64) - 1)
+
+
+# --- statistics ------------------------------------------------------------------------------------------------------
+
+FALSE_POSITIVES = 0.01  # of a statistical test; seeds are fixed, so this is how likely it was to write one that fails
+
+
+def largest_z(count):
+    """What the largest |z| of `count` standard normal numbers exceeds in 1 % of all cases (Šidák)."""
+    return scipy.stats.norm.isf((1 - (1 - FALSE_POSITIVES) ** (1 / count)) / 2)
+
+
+# --- transport without a basis ---------------------------------------------------------------------------------------
+
+
+def mesh(vertices, faces, normals=None, bsdf=None):
+    """A mesh of vertices (v, 3) and faces (f, 3); smooth where it has normals (v, 3)."""
+    mi = mitsuba()
+    properties = mi.Properties()
+    if bsdf:
+        properties["bsdf"] = mi.load_dict(bsdf)
+    result = mi.Mesh("mesh", len(vertices), len(faces), has_vertex_normals=normals is not None, props=properties)
+    parameters = mi.traverse(result)
+    parameters["vertex_positions"] = np.ravel(vertices).astype(np.float32)
+    parameters["faces"] = np.ravel(faces).astype(np.uint32)
+    if normals is not None:
+        parameters["vertex_normals"] = np.ravel(normals).astype(np.float32)
+    parameters.update()
+    return result
+
+
+def white(vectors):
+    """The sky (k, 1) of radiance 1."""
+    return np.ones((len(vectors), 1))
+
+
+@dataclass(frozen=True, eq=False)
+class SampledScene:
+    """What a precomputation knows of a scene before it fits a basis; irradiance itself then stands for coefficients.
+
+    `kept` (n,) are the points that are not buried.
+    """
+
+    scene: object
+    points: object
+    directions: object
+    transport: object
+    buried: np.ndarray
+    blocked: np.ndarray
+
+    @property
+    def kept(self):
+        return ~self.buried
+
+    @property
+    def shares(self):
+        """Shares (n,) of kept points in the area."""
+        areas = np.where(self.kept, self.points.areas, 0).astype(float)
+        return areas / areas.sum()
+
+    def direct(self, sky=white):
+        """Direct irradiance (n, k) under a sky, a function of unit directions (s, 3) that gives radiance (s, k)."""
+        return self.transport.irradiance(sky(self.directions.vectors.astype(float)), self.directions.solid_angles)
+
+    def hops(self, rays, seed=0, **rest):
+        sampler = HopSampler(self.scene, self.points, self.buried, self.transport, self.directions, rays, seed, **rest)
+        return Hops(np.concatenate(list(sampler.blocks())), self.blocked)
+
+    def paths(self, count, bounces=None, channels=1, seed=0, encode=None, **rest):
+        return PathSampler(self.scene, self.points, self.directions, count, bounces, channels, encode, seed, **rest)
+
+    def reflections(self, hops, direct, channels, bounces):
+        """Irradiance (c, n, k) after one reflection and more of direct irradiance (n, k), as a precomputation finds it."""
+        if bounces is None:
+            return solve(hops, direct, channels, None)
+        split = split_by_bounces(hops, 1 - self.blocked, self.shares, channels, bounces)
+        return solve(hops, direct, channels, split) if split.bounces else np.zeros((channels, *direct.shape), np.float32)
+
+    def reflected(self, rays, bounces, sky=white, seed=0):
+        """The same (n, k) under a sky; three radiances are RGB, and any other number is grey."""
+        direct = self.direct(sky)
+        if direct.shape[1] != 3:
+            return self.reflections(self.hops(rays, seed), direct, 1, bounces)[0]
+        coloured = self.reflections(self.hops(rays, seed), direct, 3, bounces)
+        return np.stack([coloured[channel, :, channel] for channel in range(3)], axis=-1)
+
+    def samples_of_paths(self, count, bounces, index, sky=white, seed=0):
+        """Irradiance (b, count, 3) that each path from some points gives alone, so that its noise is known too."""
+        cell, throughput, _ = self.paths(count, bounces, 3, seed).escapes(index)
+        radiance = sky(self.directions.vectors.astype(float))[np.where(cell == NOTHING, 0, cell)]
+        return np.pi * np.where((cell != NOTHING)[..., None], throughput * radiance, 0)
+
+
+def sampled(parts, edge_length, directions="cubemap:16", rays_per_direction=1):
+    """A SampledScene of a scene dict."""
+    opened = open_scene(parts)
+    points, lattice = sample_points(opened, edge_length), parse_directions(directions)
+    transport = sample_direct(opened, points, lattice, rays_per_direction)
+    buried = find_buried(opened, points, transport.dark())
+    return SampledScene(opened, points, lattice, transport, buried, blocked_share(transport, lattice.solid_angles))

@@ -34,13 +34,28 @@ SMALL = dict(
 )
 
 
-def precompute(parts=SMALL, directions="cubemap:8", edge_length=0.8, **settings):
-    return mi_prt.precompute(scene(**parts), directions=directions, edge_length=edge_length, **settings)
+COLOURED = SMALL | dict(floor=rectangle(size=2, bsdf=diffuse([0.7, 0.5, 0.2])))
+# The forms of what is stored: one channel; three channels of the components, or of the coefficients, where reflections colour the light.
+ASSETS = {
+    "direct": {},
+    "reflected": dict(parts=COLOURED, bounces=2, paths_per_point=32),
+    "reflected, sh": dict(parts=COLOURED, bounces=2, paths_per_point=32, basis="sh", coefficients=49),
+}
+
+
+def precompute(parts=SMALL, directions="cubemap:8", edge_length=0.8, bounces=0, **settings):
+    """Of direct light, unless bounces are asked for."""
+    return mi_prt.precompute(scene(**parts), directions=directions, edge_length=edge_length, bounces=bounces, **settings)
+
+
+@pytest.fixture(scope="module", params=ASSETS)
+def kind(request):
+    return request.param
 
 
 @pytest.fixture(scope="module")
-def asset():
-    return precompute()
+def asset(kind):
+    return precompute(**ASSETS[kind])
 
 
 @pytest.fixture(scope="module")
@@ -307,14 +322,18 @@ def test_bad_settings(bad):
 # --- the file ------------------------------------------------------------------------------------------------------
 
 
-def test_round_trip(asset, saved):
+def test_round_trip(kind, asset, saved):
     """What is loaded is what was saved, bit for bit."""
     loaded = mi_prt.load(saved)
+    n, d = len(asset.points), len(asset.basis)
+    assert loaded.coefficients.shape == ((n, 3, d) if kind == "reflected, sh" else (n, d))
+    assert loaded.basis.vectors.shape == ((d, 3, 384) if kind == "reflected" else (d, 384))
+    assert loaded.channels == (1 if kind == "direct" else 3)
     for name in ("positions", "normals", "geometric_normals", "albedo", "areas", "uv", "surface"):
         np.testing.assert_array_equal(getattr(loaded.points, name), getattr(asset.points, name))
     for name in ("levels", "offsets", "nodes", "back"):
         np.testing.assert_array_equal(getattr(loaded.points.patches, name), getattr(asset.points.patches, name))
-    for name in ("vectors", "mean", "sqrt_weights", "captured_variance"):
+    for name in asset.basis.ARRAYS:
         np.testing.assert_array_equal(getattr(loaded.basis, name), getattr(asset.basis, name))
     np.testing.assert_array_equal(loaded.coefficients, asset.coefficients)
     np.testing.assert_array_equal(loaded.buried, asset.buried)
@@ -339,13 +358,20 @@ def test_saving_what_was_loaded_gives_the_same_file(saved, tmp_path):
 
 
 def test_the_file_is_enough_for_h5py_and_numpy(asset, saved):
-    """As docs/asset-format.md says: E = max(0, c·(V (L√w)) + Σ w L mean), from the file's datasets alone."""
+    """As docs/asset-format.md says: E = max(0, c·(V (L√w)) + Σ w L mean), from the file's datasets alone; where vectors and mean, or
+    coefficients, are of three channels, each for its own channel of light."""
     with h5py.File(saved) as file:
         w = file["directions/solid_angles"][()]
         radiance = np.random.default_rng(1).random((len(w), 3))  # of the cells
         light = radiance * np.sqrt(w)[:, None]
-        mean = (file["basis/mean"][()] * np.sqrt(w)) @ light
-        irradiance = np.maximum(file["coefficients"][()] @ (file["basis/vectors"][()] @ light) + mean, 0)
+        coefficients, functions = file["coefficients"][()], file["basis/vectors"][()]
+        channels = []
+        for channel in range(3):
+            c = coefficients[:, channel] if coefficients.ndim == 3 else coefficients
+            v = functions[:, channel] if functions.ndim == 3 else functions
+            m = file["basis/mean"][channel] if functions.ndim == 3 else file["basis/mean"][()]
+            channels.append(c @ (v @ light[:, channel]) + (m * np.sqrt(w)) @ light[:, channel])
+        irradiance = np.maximum(np.stack(channels, axis=-1), 0)
         vectors = file["directions/vectors"][()]
         assert {"units", "format_version", "scene", "settings", "versions"} <= set(file.attrs)
     expected = asset.irradiance_from(*asset.basis.project_light(radiance.astype(np.float32)))
@@ -353,24 +379,28 @@ def test_the_file_is_enough_for_h5py_and_numpy(asset, saved):
     assert w.sum() == pytest.approx(4 * np.pi) and np.allclose(np.linalg.norm(vectors, axis=1), 1, atol=1e-5)
 
 
-def test_the_same_seed_gives_the_same_file_within_a_process(saved, tmp_path):
+def test_the_same_seed_gives_the_same_file_within_a_process(kind, saved, tmp_path):
     """Nothing of time, addresses or thread order gets into the file."""
-    precompute().save(tmp_path / "again.prt")
+    precompute(**ASSETS[kind]).save(tmp_path / "again.prt")
     assert (tmp_path / "again.prt").read_bytes() == saved.read_bytes()
 
 
 PROGRAM = """
 import sys, mi_prt
-parts = {"type": "scene", "ball": {"type": "sphere", "center": [0, 1, 0]}, "box": {"type": "cube"}, "extra": {"type": "disk"}}
-mi_prt.precompute(parts, directions="cubemap:8", edge_length=0.5).save(sys.argv[1])
+red = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.8, 0.3, 0.2]}}
+parts = {"type": "scene", "ball": {"type": "sphere", "center": [0, 1, 0], "bsdf": red}, "box": {"type": "cube"}, "extra": {"type": "disk"}}
+asset = mi_prt.precompute(parts, directions="cubemap:8", edge_length=0.5, indirect=sys.argv[2], paths_per_point=64)
+assert asset.channels == 3
+asset.save(sys.argv[1])
 """
 
 
-def test_the_same_seed_gives_the_same_file_in_two_processes(tmp_path):
-    """Another hash seed and addresses; unnamed shapes, whose made-up ids hold an address."""
+@pytest.mark.parametrize("indirect", ["solve", "paths"])
+def test_the_same_seed_gives_the_same_file_in_two_processes(tmp_path, indirect):
+    """Another hash seed and addresses; unnamed shapes, whose made-up ids hold an address. Reflections included."""
     running = [
         subprocess.Popen(
-            [sys.executable, "-c", PROGRAM, str(tmp_path / f"{i}.prt")], env=os.environ | {"PYTHONHASHSEED": str(i)}
+            [sys.executable, "-c", PROGRAM, str(tmp_path / f"{i}.prt"), indirect], env=os.environ | {"PYTHONHASHSEED": str(i)}
         )
         for i in (1, 2)
     ]
@@ -448,6 +478,44 @@ def test_arrays_that_do_not_fit_together_are_refused(saved, tmp_path, name):
 
     with pytest.raises(AssetError):
         mi_prt.load(changed(saved, tmp_path / "odd.prt", shorten))
+
+
+@pytest.mark.parametrize("channels", [None, 0, 1, 2, 3, -3, "3", [3], {}], ids=str)
+def test_channels_that_the_arrays_do_not_have_are_refused(kind, saved, tmp_path, channels):
+    """Of another number relighting would fail, or add up the wrong rows."""
+
+    def change(file):
+        file.attrs["report"] = json.dumps(json.loads(file.attrs["report"]) | {"channels": channels})
+
+    path = changed(saved, tmp_path / "odd.prt", change)
+    if channels == (1 if kind == "direct" else 3):
+        assert mi_prt.load(path).irradiance(uniform_sky()).any()
+        return
+    with pytest.raises(AssetError, match="odd.prt") as caught:
+        mi_prt.load(path)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("channels", [0, 1, 2, 4])
+def test_arrays_of_other_channels_are_refused(kind, saved, tmp_path, channels):
+    """Also where all agree on their number: light has three."""
+
+    def change(file):
+        file.attrs["report"] = json.dumps(json.loads(file.attrs["report"]) | {"channels": channels})
+        for name in ["basis/vectors", "basis/mean"] if kind == "reflected" else ["coefficients"]:
+            values = file[name][()]
+            one = values.reshape(*values.shape[: values.ndim - 1 - (kind != "direct")], -1, values.shape[-1])[..., :1, :]
+            del file[name]
+            file[name] = one.repeat(channels, axis=-2)
+
+    with pytest.raises(AssetError, match="odd.prt"):
+        mi_prt.load(changed(saved, tmp_path / "odd.prt", change))
+
+
+@pytest.mark.parametrize("report", ["{}", "[]", "3", "null"])
+def test_a_report_that_tells_nothing_is_refused(saved, tmp_path, report):
+    with pytest.raises(AssetError, match="odd.prt"):
+        mi_prt.load(changed(saved, tmp_path / "odd.prt", lambda file: file.attrs.__setitem__("report", report)))
 
 
 # --- saving --------------------------------------------------------------------------------------------------------
@@ -534,18 +602,19 @@ def test_saving_over_an_asset_and_to_a_relative_path(asset, tmp_path, monkeypatc
 # --- kernels -------------------------------------------------------------------------------------------------------
 
 
-def test_blocks_share_their_kernels(monkeypatch):
+@pytest.mark.parametrize(("bounces", "indirect"), [(0, "solve"), (2, "solve"), (2, "paths")])
+def test_blocks_share_their_kernels(monkeypatch, bounces, indirect):
     """What changes from block to block is opaque to the compiler: 80 small blocks do not need 80 kernels.
 
     A few there may be: Dr.Jit compiles anew where arrays taken from NumPy happen to be aligned otherwise. And they give the
     same bits: rays do not know their block.
     """
-    parts = SMALL | {"inner": sphere((0.2, 0.4, 0), 0.1)}  # inside the box: dark, so that the search for buried points runs
-    blocks = []
-    whole, _ = measure(scene(**parts), directions="cubemap:8", edge_length=0.4)
+    parts = COLOURED | {"inner": sphere((0.2, 0.4, 0), 0.1)}  # inside the box: dark, so that the search for buried points runs
+    settings, traced = dict(directions="cubemap:8", edge_length=0.4, indirect=indirect, bounces=bounces, paths_per_point=32), []
+    whole, _ = measure(scene(**parts), **settings)
     monkeypatch.setattr(room, "LANES", 384 * 7)
-    blocked, cost = measure(scene(**parts), None, lambda *event: blocks.append(event), directions="cubemap:8", edge_length=0.4)
-    assert blocks[0][2] > 20
+    blocked, cost = measure(scene(**parts), None, lambda stage, *_: traced.append(stage), **settings)
+    assert traced.count("transport") > 20 and (bounces == 0 or traced.count("indirect") > 5)
     assert len(whole.points) > 10 * 7 and whole.buried.sum() > 7
     assert cost["kernels"] <= 4
     np.testing.assert_array_equal(blocked.buried, whole.buried)
@@ -559,9 +628,9 @@ def test_rays_are_counted(asset):
     assert abs(asset.report["rays"] - above) <= 2e-3 * above
 
 
-def test_radiance_of_the_default_basis_is_close(asset):
+def test_radiance_of_the_default_basis_is_close():
     """48 components of this scene: within 3 % of the sampled transport under a smooth sky, without bias."""
-    lattice = Cubemap(8)
+    lattice, asset = Cubemap(8), precompute()
     sampled = sample_direct(open_scene(scene(**SMALL)), asset.points, lattice)
     expected = sampled.irradiance(np.ones((len(lattice), 3), np.float32), lattice.solid_angles)
     assert relative_l2(asset.irradiance(uniform_sky()), expected) < 0.03

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from itertools import pairwise
 from pathlib import Path
 
 import h5py
@@ -17,7 +18,7 @@ import mi_prt
 from mi_prt.cli import main
 
 SCENES = Path(__file__).resolve().parent.parent / "scenes"
-FAST = ("--directions", "cubemap:8", "--coefficients", "16")
+FAST = ("--directions", "cubemap:8", "--coefficients", "16", "--edge-length", "0.2")
 
 
 def run(capsys, *arguments):
@@ -43,17 +44,57 @@ def asset(scene, tmp_path_factory):
     return path
 
 
-def test_precompute_prints_the_promised_keys_and_nothing_else_on_stdout(scene, tmp_path, capsys):
-    code, out, err = run(capsys, "precompute", scene, "-o", tmp_path / "a.prt", *FAST, "--edge-length", "0.2", "--json")
+@pytest.mark.parametrize(
+    ("options", "bounces", "stages"),
+    [((), range(4, 20), {"indirect"}), (("--bounces", "2"), [2], {"indirect"}), (("--bounces", "0"), [0], {"coefficients"}),
+     (("--bounces", "1", "--indirect", "paths", "--paths-per-point", "16", "--no-denoise"), [1], {"indirect"})],
+    ids=lambda x: " ".join(x) if isinstance(x, tuple) else "",
+)  # fmt: skip
+def test_precompute_prints_the_promised_keys_and_nothing_else_on_stdout(scene, tmp_path, capsys, options, bounces, stages):
+    """Without an option it is light after as many reflections as it takes: in a box of albedos of about a half more than four."""
+    code, out, err = run(capsys, "precompute", scene, "-o", tmp_path / "a.prt", *FAST, *options, "--json")
     result = json.loads(out)
     assert code == 0
     assert set(result) == {
-        "points", "directions", "coefficients", "captured_variance", "relative_error", "bytes", "rays", "kernels", "peak_memory_bytes", "seconds",
+        "points", "directions", "coefficients", "bounces", "captured_variance", "relative_error", "bytes", "rays", "kernels",
+        "peak_memory_bytes", "seconds",
     }
-    assert set(result["seconds"]) == {"scene", "points", "transport", "basis", "write", "total"}
+    assert set(result["seconds"]) == {"scene", "points", "transport", "basis", "write", "total"} | stages
+    assert result["bounces"] in bounces
     assert result["directions"] == 384 and result["coefficients"] == 16
     assert result["bytes"] == (tmp_path / "a.prt").stat().st_size
     assert result["rays"] == result["points"] * 384 // 2
+
+
+@pytest.mark.parametrize("bounces", ["1", "3", "auto"])
+def test_json_is_strict(tmp_path, capsys, bounces):
+    """Between white walls there is no bound of what a few reflections leave out; and infinity is no JSON."""
+    wall = """<shape type='rectangle'><transform name='to_world'><translate z='-1'/><rotate {}/></transform>
+        <bsdf type='diffuse'><rgb name='reflectance' value='1'/></bsdf></shape>"""
+    walls = "".join(wall.format(turn) for turn in ("x='1' angle='0'", "x='1' angle='90'", "x='1' angle='-90'", "y='1' angle='90'", "y='1' angle='-90'"))
+    (tmp_path / "white.xml").write_text(
+        f"""<scene version='3.0.0'>{walls}<emitter type='constant'/><sensor type='perspective'><transform name='to_world'>
+        <lookat origin='0.1,-0.3,3' target='0,0,0' up='0,0,1'/></transform></sensor></scene>"""
+    )
+
+    settings = ("--directions", "cubemap:4", "--edge-length", "1", "--bounces", bounces)
+
+    def refuse(constant):
+        raise AssertionError(constant)
+
+    for arguments in (
+        ("precompute", tmp_path / "white.xml", "-o", tmp_path / "a.prt", *settings),
+        ("info", tmp_path / "white.xml", *settings),
+        ("info", tmp_path / "a.prt"),
+        ("compare", tmp_path / "a.prt", "-o", tmp_path / "r", "--size", "16x12", "--spp", "4"),
+    ):
+        code, out, _ = run(capsys, *arguments, "--json")
+        assert code == 0
+        json.loads(out, parse_constant=refuse)
+    with h5py.File(tmp_path / "a.prt") as file:
+        json.loads(file.attrs["report"], parse_constant=refuse)
+    page = (tmp_path / "r" / "index.html").read_text()
+    assert "Reflections:" in page and "inf" not in page.split("Reflections:")[1].split("<")[0]
 
 
 def test_relight_writes_every_format(asset, tmp_path, capsys):
@@ -88,6 +129,8 @@ def test_compare_prints_the_promised_keys_and_leaves_a_report(asset, tmp_path, c
     assert set(result["image"]) >= {"relative_rmse", "bias", "psnr", "flip", "reference_noise"}
     assert set(result["seconds"]) == {"relight", "reference"}
     assert result["reference"] == "modelled"
+    assert result["bounces"] > 4 and result["reference_bounces"] == "any number"
+    assert 0 < result["bounce_energy_left"] < 1e-3 and 0 < result["indirect_noise"] < 0.02
     names = {path.name for path in (tmp_path / "r").iterdir()}
     assert names == {
         "report.json", "index.html", "result.exr", "reference.exr", "result.png", "reference.png", "error.png", "flip.png",
@@ -95,7 +138,7 @@ def test_compare_prints_the_promised_keys_and_leaves_a_report(asset, tmp_path, c
     }
     assert json.loads((tmp_path / "r" / "report.json").read_text()) == result
     page = (tmp_path / "r" / "index.html").read_text()
-    assert "{" not in page.split("</style>")[1] and "modelled" in page
+    assert "{" not in page.split("</style>")[1] and "modelled" in page and "Reflections:" in page
 
 
 def test_info_of_a_scene_and_of_an_asset(scene, asset, capsys):
@@ -106,12 +149,22 @@ def test_info_of_a_scene_and_of_an_asset(scene, asset, capsys):
     assert set(result["predicted"]) == {"seconds", "peak_memory_bytes", "bytes", "relighting_bytes", "projection_bytes"}
     assert all({"value", "reason"} == set(entry) for entry in result["settings"].values())
     code, out, _ = run(capsys, "info", asset, "--json")
-    assert code == 0 and json.loads(out)["coefficients"] == 16
+    held = json.loads(out)
+    assert code == 0 and held["coefficients"] == 16
+    assert held["bounces"] == held["report"]["bounces"] > 4 and held["report"]["channels"] == 3
+    energy = held["report"]["bounce_energy"]
+    # Each reflection keeps less than the largest albedo of the light.
+    assert len(energy) == held["bounces"] + 1 and all(0 < after < 0.9 * before for before, after in pairwise(energy[1:]))
+    assert 0 < held["report"]["bounce_energy_left"] < 2e-3 * sum(energy)
+    chosen = held["settings"]
+    assert [chosen[name] for name in ("bounces", "indirect", "paths_per_point", "denoise")] == ["auto", "solve", "auto", True]
+    predicted = result["requires"]["bounce_energy"]
+    assert predicted[0] == pytest.approx(energy[0], rel=0.1) and predicted[1] == pytest.approx(energy[1], rel=0.3)
 
 
 def test_what_info_predicts_is_what_precompute_needs(scene, tmp_path, capsys):
     """Points and rays are counted, not guessed, so they agree exactly; bytes to 20 % (the container's own overhead)."""
-    _, out, _ = run(capsys, "info", scene, "--directions", "cubemap:8", "--coefficients", "16", "--json")
+    _, out, _ = run(capsys, "info", scene, *FAST, "--json")
     predicted = json.loads(out)
     _, out, _ = run(capsys, "precompute", scene, "-o", tmp_path / "a.prt", *FAST, "--json")
     found = json.loads(out)
@@ -140,6 +193,13 @@ def test_same_seed_same_file(scene, tmp_path, capsys):
         (("precompute", "{scene}", "-o", "{folder}/x.prt", "--directions", "ball:3"), "cubemap:N"),
         (("precompute", "{scene}", "-o", "{folder}/x.prt", "--edge-length", "short"), "neither 'auto'"),
         (("precompute", "{scene}", "-o", "{folder}/x.prt", "--rays-per-direction", "0"), "1…64"),
+        (("precompute", "{scene}", "-o", "{folder}/x.prt", "--bounces", "many"), "--bounces many is neither"),
+        (("precompute", "{scene}", "-o", "{folder}/x.prt", "--bounces", "-1"), "auto or 0…10000"),
+        (("precompute", "{scene}", "-o", "{folder}/x.prt", "--bounces", "1", "--basis", "haar"), "direct transport only"),
+        (("precompute", "{scene}", "-o", "{folder}/x.prt", "--indirect", "photons"), "solve or paths"),
+        (("precompute", "{scene}", "-o", "{folder}/x.prt", "--paths-per-point", "3"), "even number 2…65,536"),
+        (("precompute", "{scene}", "-o", "{folder}/x.prt", "--paths-per-point", "few"), "--paths-per-point few is neither"),
+        (("info", "{scene}", "--bounces", "2.5"), "--bounces 2.5 is neither"),
         (("precompute", "{scene}", "-o", "{folder}/x.prt", "--threads", "0"), "threads"),
         (("precompute", "{scene}", "-o", "{folder}/x.prt", "-D", "nonsense"), "NAME=VALUE"),
         (("relight", "missing.prt", "-o", "{folder}/x.png"), "does not exist"),

@@ -20,7 +20,7 @@ from mi_prt.basis.harmonics import (
     rotation,
 )
 from mi_prt.basis.rows import Rows
-from mi_prt.basis.target import Target, fit_of
+from mi_prt.basis.target import Fit, Target
 from mi_prt.lighting.lattice import LatticeMap
 from mi_prt.directions import Cubemap
 
@@ -437,5 +437,5 @@ def test_impossible_targets_are_refused(target):
 
 def test_a_fit_is_told_by_its_sums():
     """1 − 2/8 of the variance, and √(2/32) = ¼ of the transport's norm."""
-    result = fit_of("basis", 2.0, 8.0, 32.0)
+    result = Fit("basis", 2.0, 8.0, 32.0)
     assert (result.basis, result.captured_variance, result.relative_error) == ("basis", 0.75, 0.25)

@@ -47,14 +47,19 @@ def render(mi_scene, integrator, spp=16, seed=0, sensor=0):
     return np.array(mi.render(mi_scene, integrator=integrator, spp=spp, seed=seed, sensor=sensor))
 
 
-def by_mitsuba(mi_scene, spp=512, **rest):
-    """Direct light by Mitsuba; seeds and samples of its own."""
-    return render(mi_scene, {"type": "path", "max_depth": 2, **rest}, spp, seed=77)
+def by_mitsuba(mi_scene, spp=512, bounces=0, **rest):
+    """Light by Mitsuba after so many reflections on its way to what is seen; seeds and samples of its own."""
+    return render(mi_scene, {"type": "path", "max_depth": -1 if bounces == "auto" else 2 + bounces, **rest}, spp, seed=77)
+
+
+def precompute(parts, directions="cubemap:16", bounces=0, **settings):
+    """Of direct light, unless bounces are asked for."""
+    return mi_prt.precompute(parts, directions=directions, bounces=bounces, **settings)
 
 
 @pytest.fixture(scope="module")
 def asset():
-    return mi_prt.precompute(still_life(), directions="cubemap:16", edge_length=0.12, rays_per_direction=4)
+    return precompute(still_life(), edge_length=0.12, rays_per_direction=4)
 
 
 @pytest.fixture(scope="module")
@@ -112,14 +117,16 @@ def refused(error, match, function, *arguments):
 # --- agreement with Mitsuba ----------------------------------------------------------------------------------------
 
 
-def test_image_agrees_with_mitsubas_direct_light(asset, loaded):
+@pytest.mark.parametrize("bounces", [0, 1, "auto"])
+def test_image_agrees_with_mitsubas_light(loaded, bounces):
     """Interpolated irradiance differs from the true one by compression, lattice and facets: a few %, without bias.
 
-    The reference's own noise (512 samples a pixel) is below 1 % RMSE.
+    The reference's own noise (512 samples a pixel) is below 1 % RMSE. Reflections are 5 % of the light here.
     """
     mask = inner(loaded)
     assert 0.3 < mask.mean() < 0.95
-    compared(render(loaded, integrator_for(asset)), by_mitsuba(loaded), 0.04, mask=mask)
+    asset = precompute(still_life(), edge_length=0.12, rays_per_direction=4, bounces=bounces)
+    compared(render(loaded, integrator_for(asset)), by_mitsuba(loaded, bounces=bounces), 0.04, mask=mask)
 
 
 def test_background_is_mitsubas(asset):
@@ -177,7 +184,7 @@ def test_area_lights_are_shown_and_light_nothing():
     )
     parts = still_life(lamp=lamp)
     lit = mi.load_dict(parts)
-    asset = mi_prt.precompute(parts, directions="cubemap:8", edge_length=0.3)
+    asset = precompute(parts, "cubemap:8", edge_length=0.3)
     image, reference = render(lit, integrator_for(asset)), by_mitsuba(lit, 64)
     alone = mi.load_dict(still_life(floor=None, ball=None, lamp=lamp))
     on_lamp = inner(alone)
@@ -197,7 +204,7 @@ def test_hidden_area_lights_are_passed_through():
     """
     lamp = rectangle((0, 0, 1), (0, 0.9, 1.5), 0.5, bsdf=diffuse(0.0), emitter={"type": "area", "radiance": 5.0})
     parts = still_life(lamp=lamp)
-    asset = mi_prt.precompute(parts, directions="cubemap:16", edge_length=0.15)
+    asset = precompute(parts, edge_length=0.15)
     image = render(mi.load_dict(parts), with_hidden(asset))
     dark = mi.load_dict(still_life(lamp={k: v for k, v in lamp.items() if k != "emitter"}))
     reference = by_mitsuba(mi.load_dict(parts), 64, hide_emitters=True)
@@ -209,7 +216,7 @@ def test_hidden_area_lights_are_passed_through():
     through = inner(plain) & ~off_lamp
     assert through.sum() > 10 and reference[through].min() > 0
     # Mitsuba's lamp lights the ball from behind the camera's side or not at all: only our own pixels can be compared.
-    expected = render(plain, with_hidden(mi_prt.precompute(still_life(), directions="cubemap:16", edge_length=0.15)))
+    expected = render(plain, with_hidden(precompute(still_life(), edge_length=0.15)))
     ratio = image[through] / expected[through]
     assert 0.3 < ratio.min() and ratio.max() < 1.1
 
@@ -225,7 +232,7 @@ def test_one_sided_backs_are_black():
     for material, is_black in [(diffuse(0.8), True), ({"type": "twosided", "b": diffuse(0.8)}, False)]:
         parts = still_life(floor=None, ball=None, wall=rectangle((0, 0, -1), (0, 1, 0), 1.2, bsdf=material))
         lit = mi.load_dict(parts)
-        asset = mi_prt.precompute(parts, directions="cubemap:8", edge_length=0.5)
+        asset = precompute(parts, "cubemap:8", edge_length=0.5)
         mask = inner(lit)
         image, reference = render(lit, integrator_for(asset)), by_mitsuba(lit)
         assert mask.sum() > 50
@@ -245,21 +252,26 @@ def test_textures_keep_their_resolution(path):
     compared(image, reference, 0.05, mask=inner(lit))
 
 
-def test_materials_that_are_not_diffuse_show_their_diffuse_part():
-    """A rough plastic is shown as its diffuse reflectance, a conductor black: as the diffuse scene renders in Mitsuba."""
+@pytest.mark.parametrize("bounces", [0, "auto"])
+def test_materials_that_are_not_diffuse_show_their_diffuse_part(bounces):
+    """A rough plastic is shown, and reflects onto others, as its diffuse reflectance, a conductor black: as the diffuse scene renders
+    in Mitsuba."""
     plastic = {"type": "roughplastic", "diffuse_reflectance": {"type": "rgb", "value": [0.7, 0.5, 0.3]}}
     parts = still_life(
         floor=rectangle(size=2, bsdf={"type": "twosided", "b": plastic}),
         ball=sphere((0, 0.5, 0), 0.5, bsdf={"type": "roughconductor"}),
+        post=cube((-0.9, 0.4, 0.3), 0.4, bsdf=plastic),
     )
-    asset = mi_prt.precompute(parts, directions="cubemap:16", edge_length=0.15)
-    expected = mi.load_dict(still_life(ball=sphere((0, 0.5, 0), 0.5, bsdf=diffuse(0.0))))
+    asset = precompute(parts, edge_length=0.15, bounces=bounces)
+    black, painted = sphere((0, 0.5, 0), 0.5, bsdf=diffuse(0.0)), cube((-0.9, 0.4, 0.3), 0.4, bsdf=diffuse([0.7, 0.5, 0.3]))
+    expected = mi.load_dict(still_life(ball=black, post=painted))
     for optimize in (False, True):
         lit = mi.load_dict(parts, optimize=optimize)
-        compared(render(lit, integrator_for(asset)), by_mitsuba(expected), 0.05, mask=inner(lit))
+        compared(render(lit, integrator_for(asset)), by_mitsuba(expected, bounces=bounces), 0.05, mask=inner(lit))
 
 
-def test_instances_flipped_and_coarse_shapes():
+@pytest.mark.parametrize(("bounces", "indirect"), [(0, "solve"), ("auto", "solve"), ("auto", "paths")])
+def test_instances_flipped_and_coarse_shapes(bounces, indirect):
     """A scene of instances, flipped normals, stretched and two-sided shapes, as Mitsuba shows it."""
     t = mi.ScalarTransform4f
     parts = still_life(
@@ -271,8 +283,8 @@ def test_instances_flipped_and_coarse_shapes():
         pipe={"type": "cylinder", "p0": [1.6, 0, 0], "p1": [1.6, 1.2, 0], "radius": 0.2, "bsdf": {"type": "twosided", "b": diffuse(0.7)}},
     )  # fmt: skip
     lit = mi.load_dict(parts)
-    asset = mi_prt.precompute(parts, directions="cubemap:16", edge_length=0.15, rays_per_direction=4)
-    compared(render(lit, integrator_for(asset), 64), by_mitsuba(lit), 0.06, 0.02, mask=inner(lit))
+    asset = precompute(parts, edge_length=0.15, rays_per_direction=4, bounces=bounces, indirect=indirect, paths_per_point=256)
+    compared(render(lit, integrator_for(asset), 64), by_mitsuba(lit, bounces=bounces), 0.06, 0.02, mask=inner(lit))
 
 
 # --- use -----------------------------------------------------------------------------------------------------------
@@ -297,7 +309,7 @@ def test_from_xml_with_a_path_relative_to_it(tmp_path, monkeypatch):
     (tmp_path / "scenes" / "data").mkdir(parents=True)
     file = tmp_path / "scenes" / "ball.xml"
     file.write_text(XML.replace('type="prt"', 'type="path"').replace('<string name="filename" value="data/ball.prt"/>', ""))
-    mi_prt.precompute(file, directions="cubemap:8", edge_length=0.3).save(tmp_path / "scenes" / "data" / "ball.prt")
+    precompute(file, "cubemap:8", edge_length=0.3).save(tmp_path / "scenes" / "data" / "ball.prt")
     file.write_text(XML)
     monkeypatch.chdir(tmp_path)
     lit = mi.load_file("scenes/ball.xml")
@@ -349,7 +361,7 @@ def test_buried_points_do_not_darken_their_neighbours():
     above["to_world"] = mi.ScalarTransform4f().look_at([0.07, 4, 0.03], [0.07, 0, 0.03], [0, 0, 1]).scale(0.96)
     del above["fov"]
     parts = still_life(ball=None, slab=slab, camera=above)
-    asset = mi_prt.precompute(parts, directions="cubemap:16", edge_length=0.25, rays_per_direction=4)
+    asset = precompute(parts, edge_length=0.25, rays_per_direction=4)
     assert asset.buried.sum() > 20
     lit, alone = mi.load_dict(parts), mi.load_dict(still_life(ball=None, floor=None, slab=slab, camera=above))
     beside = inner(lit) & outer(alone)
@@ -491,7 +503,7 @@ def test_no_seam_on_a_disk():
     """A disk's centre and seam, where its lattice folds: under a constant sky each pixel is ρL, closed form."""
     parts = still_life(floor=disk(size=2, bsdf=diffuse(0.7)), ball=None, sky={"type": "constant", "radiance": 1.0})
     lit = mi.load_dict(parts)
-    asset = mi_prt.precompute(parts, directions="cubemap:8", edge_length=0.5)
+    asset = precompute(parts, "cubemap:8", edge_length=0.5)
     image, mask = render(lit, integrator_for(asset), 16), inner(lit)
     assert mask.sum() > 100
     np.testing.assert_allclose(image[mask], 0.7, rtol=0.01)

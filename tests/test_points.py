@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import scipy.spatial
 
 import mi_prt
 import mi_prt.points.points
@@ -504,6 +505,18 @@ def test_points_inside_a_closed_body_are_buried():
     np.testing.assert_array_equal(asset.buried[ball & (asset.points.positions[:, 1] > 1 + 1e-3)], False)
 
 
+@pytest.mark.parametrize("indirect", ["solve", "paths"])
+def test_a_scene_in_which_every_point_is_buried(indirect):
+    """A ball whose normals were turned inwards by mistake: all its points see backs of faces. Dark, and an asset all the same."""
+    corners = uniform_directions(np.random.default_rng(0), 400)
+    faces = scipy.spatial.ConvexHull(corners).simplices
+    a, b, c = np.moveaxis(corners[faces], 1, 0)
+    outward = (np.cross(b - a, c - a) * a).sum(axis=1) > 0
+    ball = mesh(corners, np.where(outward[:, None], faces, faces[:, ::-1]), -corners)
+    asset = mi_prt.precompute(scene(a=ball), directions="cubemap:4", edge_length=5, indirect=indirect)
+    assert asset.buried.all() and asset.report["bounces"] == 0 and not asset.irradiance(uniform_sky()).any()
+
+
 def room(walls=6, rotation=np.eye(3), **rest):
     """The first `walls` walls of a closed room of half side 1, facing inwards; the last is the ceiling (+y)."""
     normals = [(0, 1, 0), (1, 0, 0), (-1, 0, 0), (0, 0, 1), (0, 0, -1), (0, -1, 0)][:walls]
@@ -522,11 +535,12 @@ def test_a_dark_room_is_not_buried():
 
 @pytest.mark.parametrize("seed", [None, 0, 1], ids=["aligned", "turned", "turned otherwise"])
 @pytest.mark.parametrize("two_sided", [False, True])
-def test_no_light_leaks_into_a_closed_room(seed, two_sided):
-    """No point inside sees the sky, also not one on an edge, which lies in the plane of the adjoining wall."""
+@pytest.mark.parametrize("indirect", ["solve", "paths"])
+def test_no_light_leaks_into_a_closed_room(seed, two_sided, indirect):
+    """No point inside sees the sky, also not one on an edge, which lies in the plane of the adjoining wall; nor what reflects it."""
     rotation = np.eye(3) if seed is None else random_rotation(np.random.default_rng(seed))
     parts = scene(**room(rotation=rotation, **({"bsdf": TWO_SIDED} if two_sided else {})))
-    asset = mi_prt.precompute(parts, directions="cubemap:8", edge_length=0.5)
+    asset = mi_prt.precompute(parts, directions="cubemap:8", edge_length=0.5, indirect=indirect, paths_per_point=64)
     inside = (asset.points.positions * asset.points.normals).sum(axis=1) < 0
     assert inside.sum() > 100
     assert asset.irradiance(uniform_sky())[inside].max() < 0.01
@@ -541,7 +555,7 @@ def test_light_along_the_edges_of_an_open_room(seed):
     """
     rotation = np.eye(3) if seed is None else random_rotation(np.random.default_rng(seed))
     parts = scene(**room(5, rotation))
-    asset = mi_prt.precompute(parts, directions="cubemap:16", edge_length=0.7, rays_per_direction=4)
+    asset = mi_prt.precompute(parts, directions="cubemap:16", edge_length=0.7, rays_per_direction=4, bounces=0)
     local = asset.points.positions.astype(float) @ rotation
     on_edge = np.flatnonzero(((np.abs(local) > 1 - 1e-4).sum(axis=1) >= 2) & (local[:, 1] < 0.9))
     assert len(on_edge) > 20

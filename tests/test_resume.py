@@ -17,13 +17,25 @@ from conftest import cube, diffuse, disk, rectangle, scene
 from mi_prt import AssetError, SettingsError, room
 from mi_prt.basis import pca
 from mi_prt.memory import resident_bytes
+from mi_prt.runtime import mitsuba
 from mi_prt.runtime import thread_count as mitsuba_threads
+from mi_prt.transport.interreflection import MOST_SUMMED_BOUNCES
 from mi_prt.workspace import RowFile, durable, temporary
 
-SCENE = scene(
-    floor=rectangle(size=2, bsdf=diffuse(0.6)), box=cube((0.2, 0.4, 0), 0.4), ball=disk((0, 1, 0.1), (0.3, 1.5, 0), 0.6)
-)
-SETTINGS = dict(directions="cubemap:16", edge_length=0.1, coefficients=24)
+
+
+def carpet(between=0.3):
+    """A floor of 40 x 40 cells of 0.1 m, of one colour but for a line through the middle of each cell, where no point is."""
+    pixels = np.full((120, 120, 3), [0.8, 0.5, 0.3], np.float32)
+    pixels[:, 1::3] = between
+    texture = {"type": "bitmap", "bitmap": mitsuba().Bitmap(pixels), "raw": True, "filter_type": "nearest"}
+    return rectangle(size=2, bsdf={"type": "diffuse", "reflectance": texture})
+
+
+SCENE = scene(floor=carpet(), box=cube((0.2, 0.4, 0), 0.4), ball=disk((0, -1, 0.1), (0.3, 1.5, 0), 0.6, bsdf=diffuse([0.2, 0.7, 0.4])))
+SETTINGS = dict(directions="cubemap:16", edge_length=0.1, coefficients=24, bounces=0)
+REFLECTING = {name: SETTINGS | dict(bounces=2, indirect=name, paths_per_point=32) for name in ("solve", "paths")}
+RUNS = {"direct": SETTINGS} | REFLECTING
 LANES = 768 * 40  # blocks of 40 points: dozens of them
 
 
@@ -36,11 +48,27 @@ def iterations():
 
 
 @pytest.fixture(scope="module")
-def undisturbed(tmp_path_factory):
-    """The file of a run that nothing disturbed."""
-    path = tmp_path_factory.mktemp("whole") / "asset.prt"
-    mi_prt.precompute(SCENE, output=path, **SETTINGS)
-    return path
+def files(tmp_path_factory):
+    """The file of each run that nothing disturbed."""
+    folder = tmp_path_factory.mktemp("whole")
+    for name, settings in RUNS.items():
+        mi_prt.precompute(SCENE, output=folder / f"{name}.prt", **settings)
+    return {name: folder / f"{name}.prt" for name in RUNS}
+
+
+@pytest.fixture(scope="module")
+def undisturbed(files):
+    """That of direct light."""
+    return files["direct"]
+
+
+def test_the_runs_are_three(files):
+    """Coloured reflections, and another result by each way to them."""
+    assets = {name: mi_prt.load(path) for name, path in files.items()}
+    assert {name: (asset.report["bounces"], asset.channels) for name, asset in assets.items()} == {
+        "direct": (0, 1), "solve": (2, 3), "paths": (2, 3)
+    }  # fmt: skip
+    assert len({path.read_bytes() for path in files.values()}) == 3
 
 
 def partial(path):
@@ -55,56 +83,64 @@ sys.path.insert(0, sys.argv[1])
 import mi_prt
 from mi_prt import room
 from mi_prt.basis import pca
-from test_resume import LANES, SCENE, SETTINGS
+from test_resume import LANES, RUNS, SCENE
 pca.NEGLIGIBLE = 0
 room.LANES = LANES
 def progress(stage, done, total, detail):
     print(stage, done, total, flush=True)
     time.sleep(0.002)  # moments between the writes, in which a signal may arrive as well
-mi_prt.precompute(SCENE, output=sys.argv[2], resume=True, progress=progress, **SETTINGS)
+mi_prt.precompute(SCENE, output=sys.argv[2], resume=True, progress=progress, **RUNS[sys.argv[3]])
 """
 
 
-def start(path):
+def start(path, run):
     here = os.path.dirname(__file__)
     return subprocess.Popen(
-        [sys.executable, "-c", PROGRAM, here, str(path)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [sys.executable, "-c", PROGRAM, here, str(path), run], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
 
 
-@pytest.mark.parametrize("chain", range(5))
-def test_killed_runs_end_in_the_same_file(undisturbed, tmp_path, chain):
-    """Four SIGKILLs in a row at random moments after the first block, 20 in all five cases; then the run is left alone.
+@pytest.mark.parametrize(("run", "chain"), [("direct", 0), ("solve", 1), ("solve", 2), ("paths", 3), ("paths", 4)])
+def test_killed_runs_end_in_the_same_file(files, tmp_path, run, chain):
+    """Four SIGKILLs in a row at random moments, 20 in all five cases, the last two of each while reflections are computed, if there are
+    any; then the run is left alone.
 
     While it is unfinished no file of that name opens; every continuation starts at or beyond where the last one was.
     """
-    rng, path, reached, killed = np.random.default_rng(chain), tmp_path / "asset.prt", -1, 0
+    undisturbed = files[run]
+    rng, path, reached, killed = np.random.default_rng(chain), tmp_path / "asset.prt", {}, 0
     while killed < 4:
-        process = start(path)
-        first = process.stdout.readline().split()
-        assert first, process.communicate()[1][-2000:]
-        assert int(first[1]) >= reached
+        process = start(path, run)
+        lines = [process.stdout.readline()]
+        assert lines[0], process.communicate()[1][-2000:]
+        while run != "direct" and killed >= 2 and lines[-1] and not lines[-1].startswith("indirect"):
+            lines.append(process.stdout.readline())
         time.sleep(rng.uniform(0, 0.4))
         process.send_signal(signal.SIGKILL)
         output, _ = process.communicate(timeout=60)
         killed += process.returncode == -signal.SIGKILL
-        blocks = [int(line.split()[1]) for line in output.splitlines() if line.startswith("transport") and line.count(" ") == 2]
-        reached = max([int(first[1]), *blocks])
+        for stage in ("transport", "indirect"):
+            done = [int(line.split()[1]) for line in [*lines, *output.splitlines()] if line.startswith(stage) and line.count(" ") == 2]
+            assert not done or done[0] >= reached.get(stage, 0)
+            reached[stage] = max([reached.get(stage, 0), *done])
         if path.exists():  # it has to be whole, whether the process was killed after it or came to its end; then anew
             assert path.read_bytes() == undisturbed.read_bytes()
             path.unlink()
-            reached = reached if partial(path).exists() else -1
-    last = start(path)
+            reached = reached if (partial(path) / "run.json").exists() else {}
+    last = start(path, run)
     output, errors = last.communicate(timeout=120)
     assert last.returncode == 0, errors[-2000:]
     assert path.read_bytes() == undisturbed.read_bytes()
     assert os.listdir(tmp_path) == ["asset.prt"]
 
 
-@pytest.mark.parametrize("stage", ["transport", "basis", "coefficients"])
-def test_interrupts_keep_what_was_computed(undisturbed, tmp_path, monkeypatch, stage):
-    """Ctrl-C in the middle of each stage: no file, the rows of before are there, and continuing gives the same file."""
-    monkeypatch.setattr(room, "LANES", LANES)
+@pytest.mark.parametrize(
+    ("run", "stage"),
+    [("direct", "transport"), ("direct", "basis"), ("direct", "coefficients"), ("solve", "coefficients"), ("solve", "indirect"),
+     ("solve", "reflections"), ("paths", "basis"), ("paths", "indirect")],
+)  # fmt: skip
+def test_interrupts_keep_what_was_computed(files, tmp_path, monkeypatch, run, stage):
+    """Ctrl-C in the middle of each stage: no file, the rows of before are there, and continuing, with other blocks, gives the same file."""
     path, seen = tmp_path / "asset.prt", []
 
     def interrupt(at, done, total, detail):
@@ -114,12 +150,15 @@ def test_interrupts_keep_what_was_computed(undisturbed, tmp_path, monkeypatch, s
     def watch(at, done, total, detail):
         seen.append((at, done))
 
-    with pytest.raises(KeyboardInterrupt):
-        mi_prt.precompute(SCENE, output=path, progress=interrupt, **SETTINGS)
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(room, "LANES", LANES)
+        mi_prt.precompute(SCENE, output=path, progress=interrupt, **RUNS[run])
     assert not path.exists() and partial(path).is_dir()
-    mi_prt.precompute(SCENE, output=path, progress=watch, resume=True, **SETTINGS)
-    assert seen[0][0] == "transport" and seen[0][1] > 10
-    assert path.read_bytes() == undisturbed.read_bytes() and not partial(path).exists()
+    mi_prt.precompute(SCENE, output=path, progress=watch, resume=True, **RUNS[run])
+    assert seen[0][0] == "transport" and seen[0][1] > 10 * 40
+    if stage in ("indirect", "reflections"):
+        assert dict(reversed(seen))["indirect"] > 1000  # the first event of the stage
+    assert path.read_bytes() == files[run].read_bytes() and not partial(path).exists()
 
 
 # --- what may not be continued -------------------------------------------------------------------------------------
@@ -142,6 +181,7 @@ def unfinished(tmp_path):
 OTHER_SCENES = {
     "moved": SCENE | dict(box=cube((0.3, 0.4, 0), 0.4)),
     "repainted": SCENE | dict(floor=rectangle(size=2, bsdf=diffuse(0.7))),
+    "repainted between its points": SCENE | dict(floor=carpet(0.4)),
     "without the ball": {key: part for key, part in SCENE.items() if key != "ball"},
 }
 
@@ -156,7 +196,8 @@ def test_another_scene_is_refused(unfinished, other):
 @pytest.mark.parametrize(
     "change",
     [dict(directions="cubemap:8"), dict(coefficients=25), dict(seed=1), dict(rays_per_direction=2), dict(basis="haar"), dict(edge_length=0.2),
-     dict(coefficients="auto", variance=0.9)],
+     dict(coefficients="auto", variance=0.9), dict(bounces=1), dict(bounces="auto"), dict(indirect="paths"), dict(paths_per_point=64),
+     dict(denoise=False)],
     ids=str,
 )  # fmt: skip
 def test_other_settings_are_refused(unfinished, change):
@@ -294,21 +335,45 @@ def test_resume_needs_an_output():
 def test_numbers_of_other_types_are_the_same_settings(unfinished, undisturbed):
     """The command line passes text, programs NumPy's numbers."""
     settings = dict(directions="cubemap:16", edge_length="0.10", coefficients=np.int64(24), seed=np.int32(0))
-    mi_prt.precompute(SCENE, output=unfinished, resume=True, rays_per_direction=np.int16(1), **settings)
+    settings |= dict(rays_per_direction=np.int16(1), bounces=np.uint8(0))
+    mi_prt.precompute(SCENE, output=unfinished, resume=True, **settings)
     assert unfinished.read_bytes() == undisturbed.read_bytes()
 
 
 @pytest.mark.parametrize("threads", [1, 3])
-@pytest.mark.parametrize("negligible", [0, 1e9], ids=["iterated", "exact"])
-def test_results_do_not_depend_on_threads_and_memory(tmp_path, monkeypatch, threads, negligible):
+@pytest.mark.parametrize(
+    ("run", "negligible"), [("direct", 0), ("direct", 1e9), ("solve", 0), ("paths", 0)], ids=["iterated", "exact", "solve", "paths"]
+)
+def test_results_do_not_depend_on_threads_and_memory(files, tmp_path, monkeypatch, threads, run, negligible):
     """The way of the fit is chosen by shape alone, and sums are taken in an order that is fixed."""
-    monkeypatch.setattr(pca, "NEGLIGIBLE", negligible)
-    mi_prt.precompute(SCENE, output=tmp_path / "a.prt", **SETTINGS)
+    expected = files[run]
+    if negligible:
+        monkeypatch.setattr(pca, "NEGLIGIBLE", negligible)
+        mi_prt.precompute(SCENE, output=tmp_path / "a.prt", **RUNS[run])
+        expected = tmp_path / "a.prt"
     before = mitsuba_threads()
     mi_prt.runtime.set_threads(threads)
     try:
         limit = resident_bytes() + 200_000_000
-        mi_prt.precompute(SCENE, output=tmp_path / "b.prt", max_memory=limit, **SETTINGS)
+        mi_prt.precompute(SCENE, output=tmp_path / "b.prt", max_memory=limit, **RUNS[run])
+    finally:
+        mi_prt.runtime.set_threads(before)
+    assert expected.read_bytes() == (tmp_path / "b.prt").read_bytes()
+
+
+@pytest.mark.parametrize("bounces", [40, "auto"])
+def test_reflections_that_are_solved_for_do_not_depend_on_threads_and_blocks(tmp_path, monkeypatch, bounces):
+    """Between white walls, where a series is long and `auto` leaves it to a Krylov method."""
+    walls = {name: rectangle(normal, -np.array(normal), 1, bsdf=diffuse([0.95, 0.9, 0.9])) for name, normal in
+             {"floor": (0, 1, 0), "left": (1, 0, 0), "right": (-1, 0, 0), "back": (0, 0, 1), "roof": (0, -1, 0)}.items()}  # fmt: skip
+    settings = dict(directions="cubemap:8", edge_length=0.3, bounces=bounces, paths_per_point=32)
+    mi_prt.precompute(scene(**walls), output=tmp_path / "a.prt", **settings)
+    assert mi_prt.load(tmp_path / "a.prt").report["bounces"] > MOST_SUMMED_BOUNCES
+    monkeypatch.setattr(room, "LANES", LANES)
+    before = mitsuba_threads()
+    mi_prt.runtime.set_threads(3)
+    try:
+        mi_prt.precompute(scene(**walls), output=tmp_path / "b.prt", **settings)
     finally:
         mi_prt.runtime.set_threads(before)
     assert (tmp_path / "a.prt").read_bytes() == (tmp_path / "b.prt").read_bytes()
@@ -316,7 +381,7 @@ def test_results_do_not_depend_on_threads_and_memory(tmp_path, monkeypatch, thre
 
 def test_a_share_that_is_out_of_reach_costs_no_rays(tmp_path):
     """Harmonics do not get there: another share may be asked for, and the rays are not traced again."""
-    settings = dict(directions="cubemap:8", edge_length=0.3, basis="sh", coefficients="auto")
+    settings = dict(directions="cubemap:8", edge_length=0.3, basis="sh", coefficients="auto", bounces=0)
     path, seen = tmp_path / "a.prt", []
     with pytest.raises(SettingsError, match="resume"):
         mi_prt.precompute(SCENE, output=path, variance=0.99999, **settings)
@@ -343,6 +408,29 @@ def test_passes_of_a_fit_that_failed_do_not_reach_another(tmp_path, monkeypatch)
     outright = SETTINGS | dict(coefficients=tried[1])
     mi_prt.precompute(SCENE, output=tmp_path / "a.prt", resume=True, **outright)
     mi_prt.precompute(SCENE, output=tmp_path / "b.prt", **outright)
+    assert (tmp_path / "a.prt").read_bytes() == (tmp_path / "b.prt").read_bytes()
+
+
+def test_paths_kept_in_a_span_that_was_given_up_do_not_reach_another(tmp_path, monkeypatch):
+    """Reflections make a second fit necessary, to more of direct transport; there is no room for it. As many coefficients as the first
+    fit had, asked for outright, have another span by a little: the paths of an undisturbed run are told in that one."""
+    module, fits = sys.modules["mi_prt.precompute"], []
+    walls = {name: rectangle(normal, -np.array(normal), 1) for name, normal in dict(a=(0, 1, 0), b=(1, 0, 0), c=(0, 0, 1)).items()}
+    corner = scene(**{name: wall | {"bsdf": diffuse(0.9)} for name, wall in (walls | dict(box=cube((-0.2, -0.6, -0.2), 0.4))).items()})
+    settings = dict(directions="cubemap:8", edge_length=0.2, bounces=1, indirect="paths", paths_per_point=256)
+
+    def refuse(what, *_):
+        fits.append(int(what.split()[1]))
+        if len(fits) > 1:
+            raise SettingsError("no room")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "check_room", refuse)
+        with pytest.raises(SettingsError, match="no room"):
+            mi_prt.precompute(corner, output=tmp_path / "a.prt", coefficients="auto", variance=0.97, **settings)
+    assert 40 < fits[0] < fits[1] and list(partial(tmp_path / "a.prt").glob("paths-*.rows"))
+    mi_prt.precompute(corner, output=tmp_path / "a.prt", coefficients=fits[0], resume=True, **settings)
+    mi_prt.precompute(corner, output=tmp_path / "b.prt", coefficients=fits[0], **settings)
     assert (tmp_path / "a.prt").read_bytes() == (tmp_path / "b.prt").read_bytes()
 
 
@@ -440,7 +528,8 @@ def test_too_little_memory_says_how_much_is_needed():
         mi_prt.precompute(SCENE, max_memory="10M", **SETTINGS)
 
 
-def test_a_run_stays_within_its_memory_and_gives_the_same_file(undisturbed, tmp_path):
+@pytest.mark.parametrize("run", RUNS)
+def test_a_run_stays_within_its_memory_and_gives_the_same_file(files, tmp_path, run):
     """The peak of a fresh process, by the kernel's own count, with a limit that a whole wavefront does not fit into."""
     code = """
 import sys; sys.path.insert(0, sys.argv[1])
@@ -449,21 +538,22 @@ from mi_prt.basis import pca
 from mi_prt.memory import resident_bytes
 from mi_prt.runtime import mitsuba, peak_memory_bytes
 from mi_prt.scene.scene import open_scene
-from test_resume import SCENE, SETTINGS
+from test_resume import RUNS, SCENE
 pca.NEGLIGIBLE = 0
-mi_prt.precompute(SCENE, directions="cubemap:2", edge_length=1)  # what Mitsuba and Embree take once
+settings = RUNS[sys.argv[3]]
+mi_prt.precompute(SCENE, **settings | dict(directions="cubemap:2", edge_length=1, coefficients=4))  # what Mitsuba and Embree take once
 limit = resident_bytes() + 60_000_000
 def blocks(**options):
-    events = []
-    mi_prt.precompute(SCENE, progress=lambda *event: events.append(event), **options, **SETTINGS)
-    return events[0][2]
+    stages = []
+    mi_prt.precompute(SCENE, progress=lambda stage, *_: stages.append(stage), **options, **settings)
+    return stages.count("transport")
 limited = blocks(output=sys.argv[2], max_memory=limit)
 print(limit, peak_memory_bytes(), limited, blocks())
 """
     ran = subprocess.run(
-        [sys.executable, "-c", code, os.path.dirname(__file__), str(tmp_path / "a.prt")], capture_output=True, text=True, timeout=120
+        [sys.executable, "-c", code, os.path.dirname(__file__), str(tmp_path / "a.prt"), run], capture_output=True, text=True, timeout=120
     )
     assert ran.returncode == 0, ran.stderr[-2000:]
     limit, peak, limited, blocks = map(int, ran.stdout.split())
     assert peak <= limit and limited > blocks
-    assert (tmp_path / "a.prt").read_bytes() == undisturbed.read_bytes()
+    assert (tmp_path / "a.prt").read_bytes() == files[run].read_bytes()

@@ -96,7 +96,7 @@ def fit_total(fit, target, span, direct, indirect, kept):
         enough = left <= target.allowed_residual(variance, energy)
         components = 1 + int(np.argmax(enough)) if enough.any() else len(values)
     rotation = fixed_signs(rotation[:, :components])
-    shape = (channels, -1) if channels > 1 else (-1,)
+    shape = (channels, len(span.sqrt_weights)) if channels > 1 else (len(span.sqrt_weights),)
     vectors = np.einsum("cmd,ms->dcs", rotation.reshape(channels, m, components), span.vectors, optimize=True)
     basis = PCA(
         np.ascontiguousarray(vectors.reshape(components, *shape), dtype=np.float32),

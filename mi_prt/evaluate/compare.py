@@ -89,7 +89,7 @@ def compare(
 
     progress("reference at the points", 1, 3)
     started = time.perf_counter()
-    chosen = np.sort(np.random.default_rng(seed).permutation(len(asset.points))[:COMPARED_POINTS])
+    chosen = ground_truth.compared_points(asset, COMPARED_POINTS, seed)
     bounces = asset.reference_bounces
     at_points = ground_truth.irradiance(truth, asset.points.at(chosen), POINT_SAMPLES, POINT_PATHS, bounces, seed)
 
@@ -111,7 +111,7 @@ def compare(
         "directions": len(asset.directions),
         "bounces": asset.report["bounces"],
         "reference_bounces": "any number" if bounces is None else bounces,
-        "bounce_energy_left": asset.report.get("bounce_energy_left", 0.0),
+        "bounce_energy_left": asset.report.get("bounce_energy_left", 0.0) if bounces is None else 0.0,  # what the reference has more
         "indirect_noise": asset.report.get("indirect_noise", 0.0),
         "captured_variance": asset.report["captured_variance"],
         "points": {"count": len(chosen)} | _errors(irradiance[chosen], at_points),

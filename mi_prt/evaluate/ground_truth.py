@@ -82,6 +82,12 @@ def point_irradiance(mi_scene, points, spp, seed=0):
     return Reference(means, errors)
 
 
+def compared_points(asset, most, seed=0):
+    """Indices of the points, at most so many, at which an asset is compared with the truth; buried ones, which nothing shows, are not."""
+    shown = np.flatnonzero(~asset.buried | asset.buried.all())
+    return np.sort(np.random.default_rng(seed).permutation(shown)[:most])
+
+
 def irradiance(mi_scene, points, spp, paths, bounces=None, seed=0):
     """Irradiance at points, direct and after reflections; see `point_irradiance` and `indirect_irradiance`."""
     direct = point_irradiance(mi_scene, points, spp, seed)
@@ -122,7 +128,7 @@ def indirect_irradiance(mi_scene, points, spp, bounces=None, seed=0):
         return Reference(means, errors)
     # From the point on: one reflection less is on the way to what is seen from there.
     depth = path_depth(None if bounces is None else bounces - 1)
-    integrator = mi.load_dict({"type": "path", "max_depth": depth, "hide_emitters": True})
+    integrator = mi.load_dict({"type": "path", "max_depth": depth})
     step = max(1, LANES // spp)
     sampler = mi.load_dict({"type": "independent"})
     per_point = dr.opaque(mi.UInt32, spp)
@@ -133,8 +139,11 @@ def indirect_irradiance(mi_scene, points, spp, bounces=None, seed=0):
         lane = dr.arange(mi.UInt32, size * spp)
         si = interaction(lane // per_point + dr.opaque(mi.UInt32, first))
         direction = si.sh_frame.to_world(mi.warp.square_to_cosine_hemisphere(sampler.next_2d()))
-        radiance = integrator.sample(mi_scene, sampler, mi.RayDifferential3f(si.spawn_ray(direction)))[0]
-        value = mi.Color3f(radiance) * dr.pi
+        ray = mi.RayDifferential3f(si.spawn_ray(direction))
+        seen = mi_scene.ray_intersect(ray)
+        radiance = integrator.sample(mi_scene, sampler, ray, active=seen.is_valid())[0]
+        # Light of what is seen is direct. Mitsuba's `hide_emitters` would also leave out the shapes that emit.
+        value = (mi.Color3f(radiance) - seen.emitter(mi_scene).eval(seen, seen.is_valid())) * dr.pi
         sums = [dr.block_sum(channel, spp) for channel in value]
         squares = [dr.block_sum(channel * channel, spp) for channel in value]
         dr.eval(sums, squares)

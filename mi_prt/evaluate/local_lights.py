@@ -2,8 +2,6 @@
 
 import warnings
 
-import numpy as np
-
 from ..lighting.environment import LightWarning
 from ..lighting.light import Light
 from ..lighting.local import hull_warning
@@ -31,7 +29,7 @@ def measure_error(asset, lights, nearest, scene, seed=0):
     Returns
     -------
     dict
-        relative_rmse and bias (signed, relative) of the irradiance against Mitsuba's at `points` points, 4,096 at most.
+        relative_rmse and bias (signed, relative) of the irradiance against Mitsuba's at `points` points that are not buried, 4,096 at most.
 
     Raises
     ------
@@ -43,7 +41,7 @@ def measure_error(asset, lights, nearest, scene, seed=0):
     LightWarning
         If a light is inside the hull.
     """
-    chosen = np.sort(np.random.default_rng(seed).permutation(len(asset.points))[:MEASURED_POINTS])
+    chosen = ground_truth.compared_points(asset, MEASURED_POINTS, seed)
     irradiance = asset.local_irradiance(lights, nearest)
     points = asset.points.at(chosen)
     truth = ground_truth.local_irradiance(scene.occluders, points, lights)

@@ -1,6 +1,5 @@
 """The Mitsuba integrator `prt`: any sensor and film, lit from an asset in one ray per sample."""
 
-import hashlib
 from functools import cache
 
 import numpy as np
@@ -12,6 +11,7 @@ from ..points.locate import PatchLocator
 from ..runtime import VARIANTS, mitsuba
 from ..scene.materials import reflectance_at
 from ..scene.scene import Scene, SceneSource
+from ..scene.traversal import digest_of
 
 
 def register_integrator():
@@ -81,7 +81,7 @@ def _plugin_class(variant):
                 self._scene = None  # until the new one is known to fit
                 self._locator = PatchLocator(opened, self.asset.points)
                 self._wrapped, self._scene, self._light = opened, scene, None
-            light = _fingerprint(self._wrapped.distant_emitters) if self._follows_emitters else None
+            light = digest_of(self._wrapped.distant_emitters) if self._follows_emitters else None
             if self._light != light:
                 irradiance = self.asset.irradiance(scene_light(self._wrapped))
                 self._irradiance = mi.Float(irradiance.ravel())
@@ -173,19 +173,3 @@ def _load(filename):
         return load(str(mi.file_resolver().resolve(filename)))
     except InputError:
         return load(filename)
-
-
-def _fingerprint(emitters):
-    """Hash of all parameters of some emitters."""
-    import mitsuba as mi
-
-    digest = hashlib.sha256()
-    for emitter in emitters:
-        digest.update(emitter.class_name().encode())
-        parameters = mi.traverse(emitter)
-        for key in sorted(parameters.keys()):
-            value = parameters[key]
-            digest.update(key.encode())
-            value = value.matrix if hasattr(value, "matrix") else value
-            digest.update(np.ascontiguousarray(np.array(value)).tobytes())
-    return digest.hexdigest()

@@ -13,7 +13,7 @@ import numpy as np
 from ..errors import SceneError
 from ..runtime import mitsuba
 from .materials import Material, model_material
-from .traversal import children, transform_of
+from .traversal import children, digest_of, transform_of
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class Surface:
         if self.kind == "mesh":
             return ""
         if "to_world" not in mitsuba().traverse(self.shape):
-            return f"{self.kind} {self.shape.bbox()} {_digest_of_parameters(self.shape)}"
+            return f"{self.kind} {self.shape.bbox()} {digest_of([self.shape], lambda key: '.' not in key)}"
         place = self.to_world @ transform_of(self.shape)
         flipped = " flipped" if self.shape.has_flipped_normals() else ""
         return self.kind + flipped + " " + " ".join(f"{x:.6g}" for x in place[:3].ravel() + 0.0)
@@ -151,6 +151,12 @@ class Scene:
                 for values in mesh_arrays(surface.shape)[:3]:
                     digest.update(b"-" if values is None else values.tobytes())
         return digest.hexdigest()
+
+    @cached_property
+    def appearance(self):
+        """SHA-256 of the reflectance of every surface, which reflected light depends on."""
+        digests = {material: digest_of([material.modelled]) for material in dict.fromkeys(s.material for s in self.surfaces)}
+        return hashlib.sha256("".join(digests[s.material] for s in self.surfaces).encode()).hexdigest()
 
     def statistics(self):
         """Counts for reports: shapes by kind, triangles, vertices."""
@@ -330,12 +336,3 @@ def _darken(emitter):
         if key.split(".")[0] in ("radiance", "intensity", "irradiance", "sampling_weight") and "to_uv" not in key:
             parameters[key] = parameters[key] * 0
     parameters.update()
-
-
-def _digest_of_parameters(shape):
-    """SHA-256 of the numbers that a shape is made of: control points of curves and the like."""
-    digest = hashlib.sha256()
-    parameters = mitsuba().traverse(shape)
-    for key in sorted(key for key in parameters.keys() if "." not in key):  # not those of its material
-        digest.update(key.encode() + np.ascontiguousarray(np.array(parameters[key])).tobytes())
-    return digest.hexdigest()

@@ -1,5 +1,7 @@
 """Mitsuba's object graph, one level at a time."""
 
+import hashlib
+
 import numpy as np
 
 from ..runtime import mitsuba
@@ -26,3 +28,23 @@ def children(node):
 def transform_of(node):
     """An object's `to_world` as (4, 4) float64."""
     return np.array(mitsuba().traverse(node)["to_world"].matrix, dtype=np.float64).reshape(4, 4)
+
+
+def digest_of(nodes, keep=lambda key: True):
+    """SHA-256 of the class names and parameters of Mitsuba objects, as hexadecimal digits.
+
+    Parameters
+    ----------
+    nodes : iterable of mi.Object
+    keep : callable(key)
+        Which parameters count.
+    """
+    digest = hashlib.sha256()
+    for node in nodes:
+        digest.update(node.class_name().encode())
+        parameters = mitsuba().traverse(node)
+        for key in sorted(key for key in parameters.keys() if keep(key)):  # SceneParameters iterates over pairs
+            value = parameters[key]
+            value = value.matrix if hasattr(value, "matrix") else value
+            digest.update(key.encode() + np.ascontiguousarray(np.array(value)).tobytes())
+    return digest.hexdigest()

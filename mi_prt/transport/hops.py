@@ -48,6 +48,15 @@ class Hops:
         """Two operators of every other ray, independent of each other."""
         return Hops(self.rays, self.blocked, 0, 2), Hops(self.rays, self.blocked, 1, 2)
 
+    @property
+    def count(self):
+        """Rays of each point."""
+        return len(range(self.first, self.rays.shape[1] // HOP.itemsize, self.stride))
+
+    def thinned(self, factor):
+        """The same operator by every `factor`-th ray: noisier, and as many times faster."""
+        return Hops(self.rays, self.blocked, self.first, self.stride * factor)
+
     def largest_albedo(self):
         """The largest albedo, in any channel, of what is seen."""
         def largest(first):
@@ -154,7 +163,8 @@ class HopSampler:
         weights = np.abs(cosines) * self._solid_angles
         weights *= np.unpackbits(self._transport.bits[index], axis=1, count=cosines.shape[1]) == 0
         total = np.cumsum(weights, axis=1, dtype=np.float64)
-        wanted = (np.arange(self._rays) + self._offsets[index]) / self._rays * total[:, -1:]
+        # Shifted round by any part of the whole: rays that are left out (see `thinned`) are then missed in other places at each point.
+        wanted = (np.arange(self._rays) / self._rays + self._offsets[index]) % 1 * total[:, -1:]
         # Rows one behind the other make a single ascending sequence to search in.
         before = np.cumsum(np.append(0, total[:-1, -1]))[:, None]
         ray = np.searchsorted((total + before).ravel(), (wanted + before).ravel(), side="right").reshape(wanted.shape)
@@ -167,11 +177,14 @@ class HopSampler:
 
         mi = mitsuba()
         lanes = len(index) * self._rays
-        # Arrays go over flat and come back by component: those of other shapes compile a kernel for each size.
-        owner = mi.UInt32(np.repeat(index, self._rays).astype(np.uint32))
+        # Arrays go over flat and come back by component: those of other shapes compile a kernel for each size. And they are gathered
+        # from: those that are read lane by lane compile another kernel where their memory is aligned otherwise.
+        lane = dr.arange(mi.UInt32, lanes)
+        local = lane // self._rays
+        owner = dr.gather(mi.UInt32, mi.UInt32(index.astype(np.uint32)), local)
         origin = dr.gather(mi.Point3f, self._origins, owner)
-        ray = mi.Ray3f(origin, dr.gather(mi.Vector3f, mi.Float(directions.ravel()), dr.arange(mi.UInt32, lanes)))
-        active = mi.Bool(np.repeat(active, self._rays))
+        ray = mi.Ray3f(origin, dr.gather(mi.Vector3f, mi.Float(directions.ravel()), lane))
+        active = dr.gather(mi.Bool, mi.Bool(active), local)
         pi = self._scene.occluders.ray_intersect_preliminary(ray, active=active)
         si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
         _, si.wi, reflects = facing(si, ray, self._scene.surfaces)
@@ -181,7 +194,7 @@ class HopSampler:
         found &= total > _LEAST_KEPT
         # One of the three by their weights: interpolation in the mean, with a third of the entries. The number is hashed from point
         # and ray, so that it depends on nothing else.
-        number = mi.UInt32(np.tile(np.arange(self._rays) + self._seed * self._rays, len(index)).astype(np.uint32))
+        number = lane - local * self._rays + dr.opaque(mi.UInt32, self._seed * self._rays % (1 << 32))
         picked = mi.sample_tea_float32(owner, number) * total
         point = dr.select(picked < kept[0], points[0], dr.select(picked < kept[0] + kept[1], points[1], points[2]))
         albedo = reflectance_at(si, self._scene.surfaces, found)

@@ -11,6 +11,7 @@ import numpy as np
 import scipy.linalg
 from scipy.sparse.linalg import LinearOperator, bicgstab
 
+from ..errors import SceneError
 from ..parallel import one_blas_thread
 
 BOUNCE_TOLERANCE = 1e-3  # share of the irradiance under a uniform sky that `auto` leaves out
@@ -18,6 +19,10 @@ MOST_COUNTED_BOUNCES = 64  # to which `auto` follows the energy of reflections
 ROUNDING = 1e-7  # share of the irradiance that single precision does not tell
 MOST_SUMMED_BOUNCES = 24  # more of them are solved for: a Krylov method then takes fewer products
 SOLVER_TOLERANCE = 1e-5
+MOST_ITERATIONS = 500
+FAR_FROM_WHITE = 0.9  # albedo up to which a bound by albedo alone says enough
+ALBEDO_ROUNDING = 1e-4
+LEAST_RAYS = 8  # of a point, to which the rays of late reflections are thinned
 COLUMNS = 32  # coefficients worked on at a time; fixed, so that results do not depend on memory
 
 
@@ -31,7 +36,7 @@ class BounceSplit:
         Mean irradiance over the surface (weighted by area, mean of the colour channels) in units of π, what an open sky gives: direct,
         after one reflection, after two, ….
     left : float
-        Bound of what further reflections would add, in the same unit; inf where none is known.
+        What further reflections would add, in the same unit, or a bound of it; inf where none is known.
     """
 
     energy: tuple
@@ -60,15 +65,30 @@ def split_by_bounces(hops, direct, weights, channels, bounces=None):
     Returns
     -------
     BounceSplit
+
+    Raises
+    ------
+    SceneError
+        If any number of reflections is wanted, and they do not end.
     """
     term = np.broadcast_to(direct[None, :, None], (channels, len(direct), 1)).astype(np.float32)
     albedo = hops.largest_albedo()
     energy = [_mean(term, weights)]
-    left = np.inf
+    whole, left = np.inf, np.inf
+    if bounces is None and albedo > 1 + ALBEDO_ROUNDING:
+        raise SceneError(
+            f"a surface reflects {albedo:.4g} times the light that arrives at it, so reflections need not end: correct its reflectance, or "
+            "give a number of bounces (--bounces)"
+        )
+    if bounces is None and albedo > FAR_FROM_WHITE:
+        whole = energy[0] + _mean(_converged(hops, term), weights)
     while len(energy) <= (MOST_COUNTED_BOUNCES if bounces is None else bounces):
-        before, term = term, hops.apply(term)
+        term = hops.apply(term)
         energy.append(_mean(term, weights))
-        left = _remainder(before, term, weights, albedo)
+        # A reflection leaves at most the largest albedo of the flux that arrives at all surfaces, and a mean weighted by area is flux.
+        # Where that is nearly all, the bound is of no use, and what all reflections come to is solved for.
+        bound = energy[-1] * albedo / (1 - albedo) if albedo < 1 else np.inf
+        left = min(bound, max(whole - sum(energy), 0.0))
         if left <= (BOUNCE_TOLERANCE if bounces is None else ROUNDING) * sum(energy):
             break
     while len(energy) > 1 and energy[-1] == 0:
@@ -80,22 +100,7 @@ def _mean(term, weights):
     return float((term[..., 0] @ weights).mean())
 
 
-def _remainder(before, term, weights, albedo):
-    """Bound of the mean of all terms after this one.
-
-    A reflection leaves at most the largest albedo of the flux that arrives at all surfaces, and a mean weighted by area is flux. And as
-    the operator has no negative entries, where no point receives more than q times what it received a reflection earlier, the same
-    holds ever after. What follows is at most q/(1 − q) of this term, q being the albedo or that ratio.
-    """
-    ratios = [albedo]
-    lit = term > 0
-    if not (before[lit] == 0).any():
-        ratios.append(float((term[lit] / before[lit]).max(initial=0.0)))
-    q = min(ratios)
-    return _mean(term, weights) * q / (1 - q) if q < 1 else np.inf
-
-
-def solve(hops, direct, channels, bounces, progress=lambda done: None):
+def solve(hops, direct, channels, split, progress=lambda done: None):
     """Coefficients of indirect transport.
 
     Parameters
@@ -104,32 +109,53 @@ def solve(hops, direct, channels, bounces, progress=lambda done: None):
     direct : (n, m) float32
         Coefficients of direct transport, without a mean taken off.
     channels : 1 or 3
-    bounces : int or None
-        How many reflections; None for all.
+    split : BounceSplit or None
+        How many reflections, and how much energy each has: rays are spent in proportion to it. None for all of them.
     progress : callable(done)
         Called with the columns that are done.
+
+    Raises
+    ------
+    SceneError
+        If all reflections are wanted and they do not end.
 
     Returns
     -------
     (c, n, m) float32
     """
     n, m = direct.shape
+    operators = [] if split is None else [hops.thinned(factor) for factor in _thinning(split, hops.count)]
     indirect = np.empty((channels, n, m), np.float32)
     for first in range(0, m, COLUMNS):
         columns = slice(first, first + COLUMNS)
         emitted = np.broadcast_to(direct[:, columns], (channels, n, len(direct[0, columns])))
-        indirect[..., columns] = _converged(hops, emitted) if bounces is None else _summed(hops, emitted, bounces)
+        indirect[..., columns] = _converged(hops, emitted) if split is None else _summed(operators, emitted)
         progress(min(first + COLUMNS, m))
     return indirect
 
 
-def _summed(hops, direct, bounces):
-    """A·E₀ + … + Aᵏ·E₀."""
-    term = total = hops.apply(direct)
-    for _ in range(bounces - 1):
-        term = hops.apply(term)
-        total = total + term
-    return total
+def _thinning(split, rays):
+    """Of each reflection, by what power of two its rays may be thinned.
+
+    Noise of a reflection goes with its energy over the square root of its rays; what all reflections together have is least, for so many
+    rays in all, where these are in proportion to the energy.
+    """
+    first = split.energy[1]
+    for energy in split.energy[1:]:
+        most = max(rays // LEAST_RAYS, 1)
+        yield 1 << int(np.log2(np.clip(first / energy, 1, most)))
+
+
+def _summed(operators, direct):
+    """A₁·(E₀ + A₂·(E₀ + …)), from the innermost on.
+
+    What a point receives is gathered by A₁ with all its rays, whatever reflection it is of; and as what each operator gathers adds up
+    to the same share of the hemisphere, a white furnace stays white though they differ. A₁·E₀ + A₂·A₁·E₀ + … would do neither.
+    """
+    arriving = direct
+    for operator in operators[:0:-1]:
+        arriving = direct + operator.apply(arriving)
+    return operators[0].apply(arriving)
 
 
 def _converged(hops, direct):
@@ -141,8 +167,10 @@ def _converged(hops, direct):
         return (irradiance - hops.apply(irradiance)).ravel()
 
     operator = LinearOperator((first.size, first.size), matvec=remaining, dtype=np.float32)
-    solution, failed = bicgstab(operator, first.ravel(), rtol=SOLVER_TOLERANCE, atol=0.0, maxiter=MOST_COUNTED_BOUNCES)
-    return solution.reshape(first.shape) if not failed else _summed(hops, direct, MOST_COUNTED_BOUNCES)
+    solution, failed = bicgstab(operator, first.ravel(), rtol=SOLVER_TOLERANCE, atol=0.0, maxiter=MOST_ITERATIONS)
+    if failed:
+        raise SceneError("light between the scene's surfaces does not die away: give a number of bounces (--bounces)")
+    return solution.reshape(first.shape)
 
 
 def combined(halves, kept, denoise=True):

@@ -42,14 +42,16 @@ class PathSampler:
     """
 
     def __init__(self, scene, points, directions, paths, bounces, channels, encode, seed=0, lanes=LANES):
+        import drjit as dr
+
         mi = mitsuba()
         self._scene, self._count, self._directions = scene, len(points), directions
         self._paths, self._channels, self._encode = paths, channels, encode
-        self._bounces = mi.UInt32(NOTHING if bounces is None else bounces)
-        self._offset = mi.Float(RAY_OFFSET * scene.scale)
+        self._bounces = dr.opaque(mi.UInt32, NOTHING if bounces is None else bounces)
+        self._offset = dr.opaque(mi.Float, RAY_OFFSET * scene.scale)
         self._origins = mi.Float(points.ray_origins(RAY_OFFSET * scene.scale).ravel())
         self._normals = mi.Float(points.normals.ravel())
-        self._seed = mi.UInt32(seed)
+        self._seed = dr.opaque(mi.UInt32, seed % (1 << 32))
         self._step = max(1, lanes // paths)
         self.rays_per_point = paths
 
@@ -116,8 +118,11 @@ class PathSampler:
         import drjit as dr
 
         mi = mitsuba()
-        owner = mi.UInt32(np.repeat(index, self._paths).astype(np.uint32))
-        number = mi.UInt32(np.tile(np.arange(self._paths), len(index)).astype(np.uint32))
+        width = len(index) * self._paths
+        lane = dr.arange(mi.UInt32, width)
+        local = lane // self._paths
+        owner = dr.gather(mi.UInt32, mi.UInt32(index.astype(np.uint32)), local)
+        number = lane - local * self._paths
         state = mi.sample_tea_32(owner, number + self._seed * 0x9E3779B9)
         random = mi.PCG32(initstate=mi.UInt64(state[0]), initseq=mi.UInt64(state[1]))
         # First directions of a point are stratified: a low-discrepancy sequence, shifted at random for each point.
@@ -128,7 +133,6 @@ class PathSampler:
         origin = dr.gather(mi.Point3f, self._origins, owner)
         direction = mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(place))
         scene, occluders, offset, most = self._scene, self._scene.occluders, self._offset, self._bounces
-        width = len(index) * self._paths
 
         def step(origin, direction, throughput, reflections, active, random):
             ray = mi.Ray3f(origin, direction)
