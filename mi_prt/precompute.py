@@ -3,7 +3,7 @@
 import hashlib
 import time
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -214,12 +214,13 @@ class _Compression:
             before, share = fit, 1 - STRICTER * (1 - wanted) * total.variance / max(report["channels"] * fit.variance, 1e-300)
             fit = self._fit(transport, kept, Target(variance=share))
             if len(fit.basis) <= len(before.basis):
-                raise SettingsError(f"no number of coefficients captures {wanted:g} of the variance of total transport: ask for less")
+                with self._open_to_choice():
+                    raise SettingsError(f"no number of coefficients captures {wanted} of the variance of total transport: ask for less")
 
     def _fit(self, transport, kept, target):
         """The basis of direct transport."""
-        settings, workspace = self.settings, self.workspace
-        try:
+        settings = self.settings
+        with self._open_to_choice():
             fit = fit_basis(
                 settings.basis,
                 Rows(transport.rows, np.flatnonzero(kept), self.directions),
@@ -227,7 +228,7 @@ class _Compression:
                 settings.seed,
                 lambda *done: self.progress("basis", *done, ""),
                 self.room.basis,
-                workspace.keep,
+                self.workspace.keep,
             )
             if settings.coefficients not in (None, "auto") and len(fit.basis) < settings.coefficients:
                 raise SettingsError(
@@ -236,15 +237,20 @@ class _Compression:
             if target.components is None:
                 size = held_coefficient_bytes(settings, *transport.shape, len(fit.basis), self.room.channels)
                 check_room(f"keeping {len(fit.basis):,} coefficients of {len(kept):,} points", size, self.room.basis)
-        except SettingsError as error:
-            if not workspace.lasting:
-                raise
-            # Only the fit could tell. The rays are kept for another choice of coefficients, or more memory; the passes of this fit
-            # are not, because another one may start elsewhere.
-            workspace.forget_arrays()
-            workspace.record({key: value for key, value in self.identity.items() if key not in OPEN_KEYS})
-            raise SettingsError(f"all rays are traced and kept, resume (--resume) goes on from them, but {error}") from None
         return fit
+
+    @contextmanager
+    def _open_to_choice(self):
+        """Within the block, an error of what only a fit can tell leaves the run open to another choice of coefficients, or more memory."""
+        try:
+            yield
+        except SettingsError as error:
+            if not self.workspace.lasting:
+                raise
+            # The rays are kept; the passes of this fit are not, because another one may start elsewhere.
+            self.workspace.forget_arrays()
+            self.workspace.record({key: value for key, value in self.identity.items() if key not in OPEN_KEYS})
+            raise SettingsError(f"all rays are traced and kept, resume (--resume) goes on from them, but {error}") from None
 
     def _encode(self, basis, transport):
         """Coefficients of all points, block by block."""

@@ -4,7 +4,7 @@ import numpy as np
 
 from .basis.bases import coefficient_bytes, fit_bytes
 from .errors import SettingsError
-from .indirect import GREY
+from .indirect import GREY, MOST_RAYS
 from .memory import resident_bytes
 from .parallel import BLOCK_ROWS
 from .runtime import thread_count
@@ -15,6 +15,7 @@ LANE_BYTES = 40  # of a wavefront, for each of its rays
 LEAST_LANES = 1 << 16
 POINT_BYTES = 240  # for each point, what the ray tracer and the fit hold of it beside the points themselves
 INDIRECT_LANE_BYTES = 400  # the same of rays that are followed to surfaces, with what they bring back
+CHOICE_BYTES, CHOSEN_BYTES = 30, 60  # while blocked directions are drawn, for each of those that there are and of those drawn
 SUMMED_TERMS, SOLVED_TERMS = 3, 9  # vectors that a series, and a Krylov method, work on at a time
 COPIES = {"haar": 3.2}  # of the stored coefficients in memory, where blocks are put together: indices are wider there; else 2
 
@@ -79,7 +80,11 @@ class Room:
         n, s, rays = len(points), len(directions), settings.rays_per_direction
         components = target.components or 0
         self.channels = expected_channels(points, settings)
-        blocks = BLOCK_ROWS * s * (6 * rays + 12) * thread_count()
+        blocks = s * (6 * rays + 12)
+        if settings.bounces != 0 and settings.indirect == "solve":
+            drawn = MOST_RAYS if settings.paths_per_point == "auto" else settings.paths_per_point
+            blocks = max(blocks, CHOICE_BYTES * s // 2 * rays + CHOSEN_BYTES * drawn)
+        blocks *= BLOCK_ROWS * thread_count()
         fixed = POINT_BYTES * n + blocks + held_coefficient_bytes(settings, n, s, components, self.channels)
         needed = fixed + fit_bytes(settings.basis, n, s, components) + LANE_BYTES * LEAST_LANES
         if limit - held < needed:

@@ -58,18 +58,20 @@ def balls():
     )
 
 
-def blocks(box=diffuse([0.9, 0.4, 0.2])):
+def blocks(box=diffuse([0.9, 0.4, 0.2]), post=diffuse(0.0)):
     blend = {"type": "blendbsdf", "weight": {"type": "checkerboard", "to_uv": mi.ScalarTransform3f().scale([4, 4])}}
     return dict(
         floor=rectangle(size=2, bsdf=blend | {"one": diffuse([0.9, 0.7, 0.3]), "other": diffuse([0.2, 0.5, 0.9])}),
         box=cube((-0.5, 0.5, 0), 0.5, bsdf=box),
+        post=cube((0.5, 0.3, 0.8), 0.3, bsdf=post),
         wall=rectangle((-1, 0, 0), (1, 1, 0), bsdf=two_sided(bitmap(3))),
     )
 
 
-def plastic_blocks():
-    """Plastic, of which only the diffuse colour is modelled: as bright as `blocks`."""
-    return blocks({"type": "roughplastic", "diffuse_reflectance": {"type": "rgb", "value": [0.9, 0.4, 0.2]}})
+def glossy_blocks():
+    """Plastic, of which only the diffuse colour is modelled, and metal, which is modelled as black: as bright as `blocks`."""
+    plastic = {"type": "roughplastic", "diffuse_reflectance": {"type": "rgb", "value": [0.9, 0.4, 0.2]}}
+    return blocks(plastic, {"type": "roughconductor", "alpha": 0.5})
 
 
 def smooth_sky(d):
@@ -98,7 +100,7 @@ def by_mitsuba(parts, points, bounces, paths, seed):
 TEXTURED = {
     "room": (room, room, 0.15, None),
     "balls": (balls, balls, 0.15, 3),
-    "blocks": (plastic_blocks, blocks, 0.1, 1),
+    "blocks": (glossy_blocks, blocks, 0.1, 1),
 }
 
 

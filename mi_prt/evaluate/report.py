@@ -131,10 +131,9 @@ def _causes(report):
         )
     if report["bounces"] != 0:
         noise = f"noise {report['indirect_noise']:.2%} of the transport" if report["indirect_noise"] else "without noise"
-        yield (
-            f"Reflections: {noise} (more --paths-per-point lower it); light of the last ones left out is at most "
-            f"{report['bounce_energy_left']:.2%} of the direct light of an open sky."
-        )
+        left = report["bounce_energy_left"]
+        left = "has no known bound" if left is None else f"is at most {left:.2%} of the direct light of an open sky"
+        yield f"Reflections: {noise} (more --paths-per-point lower it); light of the last ones left out {left}."
     yield (
         f"Directions: light and shadows are averaged over cells of "
         f"{np.degrees(np.sqrt(4 * np.pi / report['directions'])):.1f}°, which blurs the shadow of a small sun."

@@ -92,7 +92,7 @@ def sample_points(scene, edge_length="auto"):
     Raises
     ------
     SceneError
-        If no shape can be sampled or a mesh is broken.
+        If no shape can be sampled, a mesh is broken, or a material reflects what is not finite.
     SettingsError
         If the edge length is not positive or would give more than 4 million points.
     """
@@ -133,6 +133,10 @@ def sample_points(scene, edge_length="auto"):
     levels = np.concatenate(levels).astype(np.int32)
     sizes = node_count(levels[:, 0].astype(np.int64), levels[:, 1].astype(np.int64))
     joined = {name: np.concatenate(values) for name, values in columns.items()}
+    broken = np.flatnonzero(~np.isfinite(joined["albedo"]).all(axis=1))
+    if len(broken):
+        name = surfaces[joined["surface"][broken[0]]]["name"]
+        raise SceneError(f"the material of '{name}' has reflectances that are NaN or infinite: repair its texture first")
     off = np.sum(joined["normals"] * joined["geometric_normals"], axis=1) < np.cos(np.radians(DIPPING_DEGREES))
     return Points(
         **{name: values.astype(np.int32 if name == "surface" else np.float32) for name, values in joined.items()},

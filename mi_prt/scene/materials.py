@@ -83,7 +83,7 @@ def model_material(bsdf):
 
 
 def reflectance_at(si, surfaces, active=True):
-    """Diffuse reflectance (mi.Color3f) at hits, from the modelled material of each surface.
+    """Diffuse reflectance (mi.Color3f) at hits, from the modelled material of each surface; 0 where a texture holds NaN or infinity.
 
     Parameters
     ----------
@@ -92,7 +92,10 @@ def reflectance_at(si, surfaces, active=True):
         Those of the scene that was hit.
     active : mi.Bool
     """
-    return mitsuba().Color3f(modelled_bsdf(si, surfaces).eval_diffuse_reflectance(si, active))
+    import drjit as dr
+
+    reflectance = mitsuba().Color3f(modelled_bsdf(si, surfaces).eval_diffuse_reflectance(si, active))
+    return dr.select(dr.isfinite(reflectance), reflectance, 0)
 
 
 def modelled_bsdf(si, surfaces):

@@ -20,8 +20,7 @@ from .direct import LANES, RAY_OFFSET
 
 NOTHING = 0xFFFFFFFF  # in the place of a point: what is seen reflects nothing, or nothing that is known
 HOP = np.dtype([("point", "<u4"), ("albedo", "<f4", 3)])
-HOP_LANE_BYTES = 200  # of a wavefront, for each of its rays
-_PRODUCT_ROWS = 16 * BLOCK_ROWS
+_READ_BYTES = 1 << 22  # of rays that a thread reads at a time; what it makes of them takes three times that
 _LEAST_KEPT = 1e-4  # weight of the points around a hit that are not buried, below which it counts as buried
 
 
@@ -63,10 +62,14 @@ class Hops:
             rays = self._read(first)
             return rays["albedo"].max(axis=-1, where=(rays["point"] != NOTHING)[..., None], initial=0.0).max(initial=0.0)
 
-        return float(max(map_chunks(largest, range(0, len(self.blocked), _PRODUCT_ROWS))))
+        return float(max(map_chunks(largest, self._starts())))
+
+    def _starts(self):
+        """The first points of the blocks that are worked on at a time; results do not depend on their size."""
+        return range(0, len(self.blocked), max(1, _READ_BYTES // self.rays.shape[1]))
 
     def _read(self, first):
-        rows = np.ascontiguousarray(self.rays[first : min(first + _PRODUCT_ROWS, len(self.blocked))])
+        rows = np.ascontiguousarray(self.rays[first : min(first + self._starts().step, len(self.blocked))])
         return rows.view(HOP)[:, self.first :: self.stride]
 
     def apply(self, irradiance):
@@ -94,7 +97,7 @@ class Hops:
                 matrix = scipy.sparse.csr_array((weights, columns, ends), (len(rays), len(self.blocked)))
                 result[channel, first : first + len(rays)] = matrix @ arriving
 
-        for _ in map_chunks(product, range(0, len(self.blocked), _PRODUCT_ROWS)):
+        for _ in map_chunks(product, self._starts()):
             pass
         return result
 
@@ -128,11 +131,12 @@ class HopSampler:
         self._locator = PatchLocator(scene, points)
         self._kept = mi.Float(np.where(buried, 0.0, 1.0).astype(np.float32))
         self._origins = mi.Float(points.ray_origins(RAY_OFFSET * scene.scale).ravel())
-        vectors = transport.vectors.reshape(-1, 3)
+        # Cell by cell: a sweep over all directions for each of a cell's rays would meet the strata in the same places again and again.
+        vectors = transport.vectors.swapaxes(0, 1).reshape(-1, 3)
         lengths = np.linalg.norm(vectors, axis=1)  # the share of its cell that each ray stands for
         self._vectors = vectors / lengths[:, None]
         half = len(directions) // 2
-        self._solid_angles = (np.tile(directions.solid_angles[:half], len(transport.vectors)) * lengths).astype(np.float32)
+        self._solid_angles = (np.repeat(directions.solid_angles[:half], len(transport.vectors)) * lengths).astype(np.float32)
         self._rays = rays
         self._offsets = np.random.default_rng(seed).random((len(points), 1), dtype=np.float32)
         self._lanes = lanes
@@ -161,7 +165,8 @@ class HopSampler:
         """K blocked directions of some points (b, K, 3), stratified, in proportion to cosine times solid angle; and if there are any."""
         cosines = self._points.normals[index] @ self._vectors.T
         weights = np.abs(cosines) * self._solid_angles
-        weights *= np.unpackbits(self._transport.bits[index], axis=1, count=cosines.shape[1]) == 0
+        bits = np.unpackbits(self._transport.bits[index], axis=1, count=cosines.shape[1])
+        weights *= bits.reshape(len(index), len(self._transport.vectors), -1).swapaxes(1, 2).reshape(weights.shape) == 0
         total = np.cumsum(weights, axis=1, dtype=np.float64)
         # Shifted round by any part of the whole: rays that are left out (see `thinned`) are then missed in other places at each point.
         wanted = (np.arange(self._rays) / self._rays + self._offsets[index]) % 1 * total[:, -1:]
@@ -169,8 +174,8 @@ class HopSampler:
         before = np.cumsum(np.append(0, total[:-1, -1]))[:, None]
         ray = np.searchsorted((total + before).ravel(), (wanted + before).ravel(), side="right").reshape(wanted.shape)
         ray = np.clip(ray - np.arange(len(index))[:, None] * total.shape[1], 0, total.shape[1] - 1)
-        sign = np.where(np.take_along_axis(cosines, ray, axis=1) < 0, -1, 1)
-        return (self._vectors[ray] * sign[..., None]).astype(np.float32), total[:, -1] > 0
+        sign = np.where(np.take_along_axis(cosines, ray, axis=1) < 0, np.float32(-1), np.float32(1))
+        return self._vectors[ray] * sign[..., None], total[:, -1] > 0
 
     def _traced(self, index, directions, active):
         import drjit as dr
