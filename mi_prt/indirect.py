@@ -45,10 +45,9 @@ class IndirectTransport:
     transport : DirectTransport
     directions : DirectionLattice
     settings : Settings
-    span : LinearBasis
-        Without a mean, see `basis.total.carrier`.
-    direct : (n, m) float32
-        Coefficients of direct transport in it.
+    carrier : Carrier
+    direct : (n, m + p) float32
+        Direct transport in it.
     blocked : (n,) float32
         Share of each point's cosine-weighted hemisphere in which it sees a surface.
     lanes : int
@@ -61,7 +60,7 @@ class IndirectTransport:
     transport: object
     directions: object
     settings: object
-    span: object
+    carrier: object
     direct: np.ndarray
     blocked: np.ndarray
     lanes: int
@@ -78,13 +77,14 @@ class IndirectTransport:
         if rays == "auto":
             first, second = self._hop_halves(few, hops, seen) if settings.indirect == "solve" else self._path_halves(few)
             # With a single ray from each point; strata make it less. Points that see nothing have none.
-            noise = PILOT_RAYS / 4 * float(np.sum(np.square(first - second))) / len(few) * len(seeing)
-            wanted = noise / max(NOISE_TOLERANCE**2 * float(np.sum(np.square(self.direct[~self.buried]))), 1e-300)
+            m = len(self.carrier.span)
+            noise = PILOT_RAYS / 4 * float(np.sum(np.square(first - second)[:, :m])) / len(few) * len(seeing)
+            wanted = noise / max(NOISE_TOLERANCE**2 * float(np.sum(np.square(self.direct[~self.buried, :m]))), 1e-300)
             rays = 1 << int(np.ceil(np.log2(np.clip(wanted, LEAST_RAYS, MOST_RAYS))))
         return Demand(rays, 3 if coloured else 1)
 
     def _hop_halves(self, few, hops, seen):
-        """Coefficients (few, m) of light after one reflection, by every other ray and by the rest."""
+        """What is carried (few, m + p) of light after one reflection, by every other ray and by the rest."""
         arriving = np.zeros((*hops.shape, self.direct.shape[1]), np.float32)
         arriving[seen] = self.direct[hops["point"][seen]] * hops["albedo"][seen].mean(axis=-1, keepdims=True)
         return [self.blocked[few, None] * arriving[:, first::2].mean(axis=1) for first in (0, 1)]
@@ -111,26 +111,36 @@ class IndirectTransport:
         -------
         coefficients : (c, n, m) float32 or None
             None where no light is reflected to any point.
+        growth : float
+            See `basis.total.fit_total`.
         report : dict
         """
         halves, split = (self._solved if self.settings.indirect == "solve" else self._traced)(demand, workspace, trace, progress)
         if split.bounces == 0:
-            return None, direct_report(split.energy[0])
-        coefficients, noise, passed = combined(halves, ~self.buried, self.settings.denoise)
-        size = float(np.linalg.norm(coefficients[:, ~self.buried])) * noise**0.5
-        total = float(np.linalg.norm(self.direct[~self.buried])) * demand.channels**0.5
-        return coefficients, {
+            return None, 0.0, direct_report(split.energy[0])
+        m, kept = len(self.carrier.span), ~self.buried
+        growth = self._growth([half[..., m:] for half in halves], kept)
+        coefficients, noise, passed = combined([half[..., :m] for half in halves], kept, self.settings.denoise)
+        total = float(np.linalg.norm(self.direct[kept, :m])) * demand.channels**0.5
+        return coefficients, growth, {
             "bounces": split.bounces,
             "bounce_energy": [float(f"{x:.6g}") for x in split.energy],
             "bounce_energy_left": split.left if np.isfinite(split.left) else None,
             "channels": demand.channels,
             "paths_per_point": demand.rays,
-            "indirect_noise": size / max(total, 1e-300),
+            "indirect_noise": noise / max(total, 1e-300),
             "indirect_noise_passed": passed**0.5,
         }
 
+    def _growth(self, halves, kept):
+        """Of what the coefficients leave out: squared norm after reflections, summed over channels, over that before, by the probes."""
+        lost = self.direct[kept, len(self.carrier.span) :]
+        # Noise of the two halves is independent, and so has no part in the mean of their product.
+        after = sum(float(np.vdot(lost + a[kept], lost + b[kept])) for a, b in zip(*halves))
+        return max(after, 0.0) / max(float(np.vdot(lost, lost)), 1e-300)
+
     def _solved(self, demand, workspace, trace, progress):
-        """Two independent estimates (c, n, m) by a series of hops, None where there is no light; and the BounceSplit."""
+        """Two independent estimates (c, n, m + p) by a series of hops, None where there is no light; and the BounceSplit."""
         sampler = self._hop_sampler(demand.rays)
         m, channels = self.direct.shape[1], demand.channels
         with closing(workspace.rows("hops", len(self.points), sampler.row_bytes)) as rays:
@@ -152,7 +162,7 @@ class IndirectTransport:
         sampler = self._path_sampler(demand, self.points)
         m = self.direct.shape[1]
         # What is kept are coefficients, which mean nothing in another span.
-        name = f"paths-{zlib.crc32(np.ascontiguousarray(self.span.vectors)):08x}"
+        name = f"paths-{zlib.crc32(np.ascontiguousarray(self.carrier.span.vectors)):08x}"
         with closing(workspace.rows(name, len(self.points), sampler.row_bytes(m))) as rows:
             trace("indirect", sampler, rows)
             halves, energies = _unpacked(rows[:], demand.channels, m)
@@ -171,7 +181,7 @@ class IndirectTransport:
         return HopSampler(self.scene, self.points, self.buried, self.transport, self.directions, rays, seed, self.lanes)
 
     def _path_sampler(self, demand, points):
-        seed, encode = self.settings.seed, self.span.encode
+        seed, encode = self.settings.seed, self.carrier.encode
         return PathSampler(self.scene, points, self.directions, demand.rays, self._most, demand.channels, encode, seed, self.lanes)
 
 

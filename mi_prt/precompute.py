@@ -195,23 +195,24 @@ class _Compression:
     def _with_reflections(self, fit, transport, buried, blocked, kept):
         """Fit, coefficients and report of total transport; None where no light is reflected to any point."""
         while True:
-            span = carrier(fit.basis)
-            direct = self._encode(span, transport)
+            carried = carrier(fit.basis)
+            direct = self._encode(carried, transport)
             lanes = max(1, self.room.lanes * LANE_BYTES // INDIRECT_LANE_BYTES)
             indirect = IndirectTransport(
-                self.scene, self.points, buried, transport, self.directions, self.settings, span, direct, blocked, lanes
+                self.scene, self.points, buried, transport, self.directions, self.settings, carried, direct, blocked, lanes
             )
-            coefficients, report = indirect.coefficients(
+            coefficients, growth, report = indirect.coefficients(
                 indirect.demand(), self.workspace, lambda *job: _trace(*job, self.progress), self.progress
             )
             if coefficients is None:
                 return None
-            total, coefficients = fit_total(fit, self.target, span, direct, coefficients, kept)
+            direct = direct[:, : len(carried.span)]
+            total, coefficients = fit_total(fit, self.target, carried.span, direct, coefficients, growth, kept)
             wanted = self.target.variance
             if wanted is None or total.captured_variance >= wanted:
                 return total, coefficients, report
             # Reflections make transport vary less: direct transport has to be compressed with less loss.
-            before, share = fit, 1 - STRICTER * (1 - wanted) * total.variance / max(report["channels"] * fit.variance, 1e-300)
+            before, share = fit, 1 - STRICTER * (1 - wanted) * total.variance / max(growth * fit.variance, 1e-300)
             fit = self._fit(transport, kept, Target(variance=share))
             if len(fit.basis) <= len(before.basis):
                 with self._open_to_choice():

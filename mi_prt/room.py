@@ -3,6 +3,7 @@
 import numpy as np
 
 from .basis.bases import coefficient_bytes, fit_bytes
+from .basis.total import PROBES
 from .errors import SettingsError
 from .indirect import GREY, MOST_RAYS
 from .memory import resident_bytes
@@ -33,6 +34,7 @@ def held_coefficient_bytes(settings, points, directions, components, channels):
     size = coefficient_bytes(settings.basis, points, directions, components, settings.rays_per_direction)
     held = COPIES.get(settings.basis, 2) * size
     if settings.bounces != 0:
+        size = size * (components + PROBES) // max(components, 1)
         # Direct transport; two estimates of indirect transport, and their difference or the rows they come from; what is summed of
         # some columns.
         columns = 4 * points * channels * (SUMMED_TERMS if settings.bounces != "auto" else SOLVED_TERMS) * min(COLUMNS, components + 1)

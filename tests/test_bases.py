@@ -32,7 +32,7 @@ def sky():
     """A smooth sky with a bright and coloured patch about (1, 2, 1)."""
     toward = np.array([1, 2, 1]) / 6**0.5
     colour = np.array([3.0, 2.0, 1.0])
-    return mi_prt.EnvironmentMap(sky_of(lambda d: 0.3 + np.exp(8 * (d @ toward - 1))[:, None] * colour))
+    return mi_prt.EnvironmentMap(sky_of(lambda d: 0.3 + np.exp(8 * (d @ toward - 1))[:, None] * colour, 64))
 
 
 def precompute(parts=PARTS, directions="cubemap:16", edge_length=0.3, bounces=0, **settings):

@@ -269,13 +269,13 @@ def test_filter_comes_near_to_the_best_linear_one(noise):
     nu = noise**2 / 2
     variances = np.array([64.0, 16, 4, 1])
     best = np.sum(variances * nu / (variances + nu))
-    plain, share, passed = combined(halves_of(signal, noise, 1), np.ones(n, bool), denoise=False)
-    assert passed == 1 and share == pytest.approx(m * nu / (np.mean(np.sum(signal**2, axis=1)) + m * nu), rel=0.03)
-    filtered, same_share, passed = combined(halves_of(signal, noise, 1), np.ones(n, bool))
+    plain, size, passed = combined(halves_of(signal, noise, 1), np.ones(n, bool), denoise=False)
+    assert passed == 1 and size == pytest.approx(np.sqrt(n * m * nu), rel=0.02)
+    filtered, same_size, passed = combined(halves_of(signal, noise, 1), np.ones(n, bool))
     errors = [np.mean(np.sum((x[0] - signal) ** 2, axis=1)) for x in (plain, filtered)]
     assert errors[0] == pytest.approx(m * nu, rel=0.03)
     assert 0.95 * best < errors[1] < 1.1 * best and errors[1] < 0.5 * errors[0]
-    assert same_share == share
+    assert same_size == size
     assert passed == pytest.approx(np.sum((variances / (variances + nu)) ** 2) / m, rel=0.1)
 
 
@@ -283,9 +283,9 @@ def test_filter_leaves_alone_what_has_no_noise():
     """Equal halves come out bit for bit; and so, to rounding, does a quantity on which halves with noise elsewhere agree."""
     signal = low_rank(500, 12, seed=3)
     (half, _), kept = halves_of(signal, 0.0, 4), np.ones(500, bool)
-    mean, share, passed = combined([half.copy(), half.copy()], kept)
+    mean, size, passed = combined([half.copy(), half.copy()], kept)
     np.testing.assert_array_equal(mean, half)
-    assert share == 0 and passed == 1
+    assert size == 0 and passed == 1
 
     rng = np.random.default_rng(5)
     agreed = rng.standard_normal(12)

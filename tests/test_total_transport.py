@@ -132,12 +132,7 @@ def captured(asset, total):
     return 1 - residual / np.sum((total - total.mean(axis=0)) ** 2), np.sqrt(residual / np.sum(total**2))
 
 
-UNDERSTATED = pytest.mark.xfail(
-    strict=True, reason="what compression loses of direct transport is reflected too, and the residual of fit_total leaves that out"
-)
-
-
-@pytest.fixture(scope="module", params=[0.2, pytest.param(0.95, marks=UNDERSTATED)])
+@pytest.fixture(scope="module", params=[0.2, 0.95])
 def boxed(request):
     """Walls of one albedo, and a cube on the floor: some points are buried. The scene, and its total transport."""
     parts = corner(*[request.param] * 3, box=cube((-0.5, -0.6, -0.5), 0.4, bsdf=diffuse(request.param)))
@@ -151,13 +146,16 @@ ONCE = dict(bounces=1, edge_length=0.5)
 
 @pytest.mark.parametrize("basis", ["pca", "sh", "haar-shared"])
 def test_reported_errors_are_those_of_the_whole_matrix(basis, boxed):
-    """Captured variance and relative error, told from coefficients, against total transport formed as a matrix (n, s)."""
+    """Captured variance and relative error, told from coefficients, against total transport formed as a matrix (n, s).
+
+    What reflections do to the part that is lost is told by 16 random probes, hence 3 %; leaving it out errs by 9 % at albedo 0.95.
+    """
     parts, total = boxed
     asset = precompute(parts, basis=basis, coefficients=16, **ONCE)
     variance, error = captured(asset, total)
     assert 0.3 < variance < 0.99
     assert asset.report["captured_variance"] == pytest.approx(variance, abs=0.01)
-    assert asset.report["relative_error"] == pytest.approx(error, rel=0.01)
+    assert asset.report["relative_error"] == pytest.approx(error, rel=0.03)
 
 
 def test_share_of_the_variance_is_that_of_total_transport(boxed):

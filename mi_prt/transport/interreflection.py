@@ -193,7 +193,7 @@ def combined(halves, kept, denoise=True):
     -------
     mean : (c, n, m) float32
     noise : float
-        Share of the mean's squared norm that is noise, before filtering.
+        Norm of the noise of the mean at kept points, before filtering.
     kept_noise : float
         Share of the noise's squared norm that the filter lets through; 1 without it.
     """
@@ -203,9 +203,9 @@ def combined(halves, kept, denoise=True):
     first *= np.float32(0.5)
     m = first.shape[-1]
     total, noise, centre = _moments(first, difference, kept)
-    share = float(np.trace(noise) / max(np.trace(total) + kept.sum() * len(first) * centre @ centre, 1e-300))
+    size = float(np.trace(noise)) ** 0.5
     if not denoise or not np.trace(noise) > 0:
-        return first, share, 1.0
+        return first, size, 1.0
     with one_blas_thread():
         values, vectors = scipy.linalg.eigh(total)
         significant = values > values[-1] * m * np.finfo(np.float32).eps
@@ -218,7 +218,7 @@ def combined(halves, kept, denoise=True):
         passed = float(np.trace((np.eye(m) - taken).T @ noise @ (np.eye(m) - taken)) / np.trace(noise))
         for channel in first:
             channel -= (channel - centre.astype(np.float32)) @ taken.astype(np.float32)
-    return first, share, passed
+    return first, size, passed
 
 
 def _moments(mean, difference, kept):
