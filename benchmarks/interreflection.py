@@ -49,7 +49,7 @@ def methods(assets, pictures):
     """Both ways against Mitsuba, over the number of rays."""
     yield "## Two ways: `solve` and `paths`\n"
     yield (
-        f"Irradiance by {BOUNCES} reflections alone (the difference of an asset with and one without them, 192 coefficients) at {COMPARED} points under the "
+        f"Irradiance by {BOUNCES} reflections alone (the difference of an asset with and one without them, 64 coefficients) at {COMPARED} points under the "
         "scene's own sky, against Mitsuba's `path` (16,384 paths from each point). `solve` sends rays once and lets light go from point to point; "
         "`paths` follows it from each point until it leaves. Seconds are those of the reflections alone. *Not denoised* are the same "
         "rays with `--no-denoise`.\n"
@@ -59,7 +59,7 @@ def methods(assets, pictures):
         path = ROOT / "scenes" / f"{name}.xml"
         scene = open_scene(path)
         light = scene_light(scene)
-        direct, _ = measure(path, coefficients=192, bounces=0)
+        direct, _ = measure(path, coefficients=64, bounces=0)
         chosen = _some(direct)
         truth = ground_truth.indirect_irradiance(lit_scene(scene.modelled(), light), direct.points.at(chosen), 16384, BOUNCES)
         whole = ground_truth.point_irradiance(lit_scene(scene.modelled(), light), direct.points.at(chosen), 8192).mean + truth.mean
@@ -71,7 +71,7 @@ def methods(assets, pictures):
         for way in ("solve", "paths"):
             curve = []
             for rays in RAYS:
-                settings = {"coefficients": 192, "bounces": BOUNCES, "indirect": way, "paths_per_point": rays}
+                settings = {"coefficients": 64, "bounces": BOUNCES, "indirect": way, "paths_per_point": rays}
                 asset, cost = measure(path, **settings)
                 plain = mi_prt.precompute(path, denoise=False, **settings)
                 errors = [_error(a.irradiance(light)[chosen] - without, truth) for a in (asset, plain)]

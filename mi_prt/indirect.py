@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from .transport.hops import NOTHING, Hops, HopSampler
-from .transport.interreflection import MOST_SUMMED_BOUNCES, BounceSplit, combined, solve, split_by_bounces
+from .transport.interreflection import MOST_SUMMED_BOUNCES, BounceSplit, check_ending, combined, solve, split_by_bounces
 from .transport.paths import ENERGY_BINS, PathSampler
 
 PILOT_POINTS = 256
@@ -66,13 +66,15 @@ class IndirectTransport:
     lanes: int
 
     def demand(self):
-        """Find out what the scene calls for, by a few rays from some of its points; a Demand."""
+        """Find out what the scene calls for, by a few rays from some of its points; a Demand. Raises SceneError as `check_ending`."""
         settings = self.settings
         seeing = np.flatnonzero((self.blocked > 0) & ~self.buried)
         few = np.sort(np.random.default_rng(settings.seed).permutation(seeing)[:PILOT_POINTS])
         hops = self._hop_sampler(PILOT_RAYS).rows(few)
         seen = hops["point"] != NOTHING
         coloured = any(np.ptp(x, axis=-1).max(initial=0) > GREY for x in (self.points.albedo, hops["albedo"][seen]))
+        if settings.bounces == "auto":
+            check_ending(max(float(x.max(initial=0.0)) for x in (self.points.albedo, hops["albedo"][seen])))
         rays = settings.paths_per_point
         if rays == "auto":
             first, second = self._hop_halves(few, hops, seen) if settings.indirect == "solve" else self._path_halves(few)

@@ -170,7 +170,8 @@ def _probe_reflections(scene, points, directions, settings):
     Returns
     -------
     dict
-        energy (see `BounceSplit`; direct light within about 3 %, reflections 20 %), bounces (expected), rate (paths per second), paths (from each point).
+        energy (see `BounceSplit`; direct light within about 3 %, reflections 20 %), bounces (expected), rate (paths
+        per second), paths (from each point).
     """
     index = np.random.default_rng(settings.seed).permutation(len(points))[:PROBE_POINTS]
     few = points.at(index)

@@ -155,8 +155,9 @@ class Scene:
     @cached_property
     def appearance(self):
         """SHA-256 of the reflectance of every surface, which reflected light depends on."""
-        digests = {material: digest_of([material.modelled]) for material in dict.fromkeys(s.material for s in self.surfaces)}
-        return hashlib.sha256("".join(digests[s.material] for s in self.surfaces).encode()).hexdigest()
+        materials = {material: digest_of([material.modelled]) for material in dict.fromkeys(s.material for s in self.surfaces)}
+        shapes = {s.shape: digest_of([s.shape], _is_appearance) for s in self.surfaces}
+        return hashlib.sha256("".join(materials[s.material] + shapes[s.shape] for s in self.surfaces).encode()).hexdigest()
 
     def statistics(self):
         """Counts for reports: shapes by kind, triangles, vertices."""
@@ -328,6 +329,11 @@ def _group_of(instance):
     if not found:
         raise SceneError(f"the shape group of instance '{instance.id()}' cannot be told: expand it into shapes")
     return found[1]
+
+
+def _is_appearance(key):
+    """Whether a shape's parameter is one that materials look up: texture coordinates or an attribute such as vertex_color."""
+    return key.startswith(("vertex_", "face_")) and key not in ("vertex_positions", "vertex_normals")
 
 
 def _darken(emitter):

@@ -75,16 +75,15 @@ def split_by_bounces(hops, direct, weights, channels, bounces=None):
     albedo = hops.largest_albedo()
     energy = [_mean(term, weights)]
     whole, left = np.inf, np.inf
-    if bounces is None and albedo > 1 + ALBEDO_ROUNDING:
-        raise SceneError(
-            f"a surface reflects {albedo:.4g} times the light that arrives at it, so reflections need not end: correct its reflectance, or "
-            "give a number of bounces (--bounces)"
-        )
+    if bounces is None:
+        check_ending(albedo)
     if bounces is None and albedo > FAR_FROM_WHITE:
         whole = energy[0] + _mean(_converged(hops, term), weights)
     while len(energy) <= (MOST_COUNTED_BOUNCES if bounces is None else bounces):
         term = hops.apply(term)
         energy.append(_mean(term, weights))
+        if not np.isfinite(energy[-1]):
+            raise SceneError(f"light grows without bound after {len(energy) - 1} reflections: a surface of albedo {albedo:.4g} reflects more than arrives")
         # A reflection leaves at most the largest albedo of the flux that arrives at all surfaces, and a mean weighted by area is flux.
         # Where that is nearly all, the bound is of no use, and what all reflections come to is solved for.
         bound = energy[-1] * albedo / (1 - albedo) if albedo < 1 else np.inf
@@ -94,6 +93,15 @@ def split_by_bounces(hops, direct, weights, channels, bounces=None):
     while len(energy) > 1 and energy[-1] == 0:
         energy.pop()
     return BounceSplit(tuple(energy), left)
+
+
+def check_ending(albedo):
+    """Raise SceneError where any number of reflections need not end, because a surface of this albedo reflects more than arrives."""
+    if albedo > 1 + ALBEDO_ROUNDING:
+        raise SceneError(
+            f"a surface reflects {albedo:.4g} times the light that arrives at it, so reflections need not end: correct its reflectance, or "
+            "give a number of bounces (--bounces)"
+        )
 
 
 def _mean(term, weights):
