@@ -87,9 +87,10 @@ def methods(assets, pictures):
     axes[0].set_ylabel("error of reflected light"), axes[0].legend(fontsize=8)
     yield saved(figure, pictures, "methods")
     yield (
-        "The same number of rays costs `paths` more and leaves it with ten times the noise: a path brings back one direction, a hop all that the point at its "
-        "end sees. What `solve` levels off at is interpolation of irradiance between points and the basis, the same for any number of rays. `paths` is the "
-        "way where nothing must be taken from other points: few points on large faces, or a proof; its bias is that of the basis alone."
+        "The same number of rays takes about as long either way, and leaves `paths` with several times the noise: a path brings back one direction, a hop all that "
+        "the point at its end sees. `solve` with 64 rays is better than `paths` with 1,024, and is the default. What it levels off at is the basis (6.5 % in the Cornell "
+        "box) and interpolation of irradiance between points (still life, whose points are 0.23 m apart), the same for any number of rays. `paths` is the "
+        "way where nothing must be taken from other points: few points on large faces, nearly closed white rooms, or a proof; its bias is that of the basis alone."
     )
 
 
