@@ -88,7 +88,7 @@ def methods(assets, pictures):
     yield saved(figure, pictures, "methods")
     yield (
         "The same number of rays takes about as long either way, and leaves `paths` with several times the noise: a path brings back one direction, a hop all that "
-        "the point at its end sees. `solve` with 64 rays is better than `paths` with 1,024, and is the default. What it levels off at is the basis (6.5 % in the Cornell "
+        "the point at its end sees. `solve` with 64 rays is as good as `paths` with 1,024 or better, and is the default. What it levels off at is the basis (6.5 % in the Cornell "
         "box) and interpolation of irradiance between points (still life, whose points are 0.23 m apart), the same for any number of rays. `paths` is the "
         "way where nothing must be taken from other points: few points on large faces, nearly closed white rooms, or a proof; its bias is that of the basis alone."
     )
@@ -180,7 +180,7 @@ def speed(assets, pictures):
     yield "## Speed: bunny on a plane\n"
     started = time.perf_counter()
     content = bunny_on_plane(assets)
-    settings = {"directions": "cubemap:32", "rays_per_direction": 4, "coefficients": 384}
+    settings = {"directions": "cubemap:32", "rays_per_direction": 4, "coefficients": 448}
     asset, cost = measure(content, bounces=BOUNCES, **settings)
     seconds = time.perf_counter() - started
     started = time.perf_counter()
@@ -188,7 +188,7 @@ def speed(assets, pictures):
     direct_seconds = time.perf_counter() - started
     stages = ", ".join(f"{name} {value:.1f}" for name, value in cost["seconds"].items())
     yield (
-        f"{len(asset.points):,} points, `cubemap:32` with 4 rays in each cell, 384 coefficients, {BOUNCES} reflections, albedo 0.5, "
+        f"{len(asset.points):,} points, `cubemap:32` with 4 rays in each cell, 448 coefficients, {BOUNCES} reflections, albedo 0.5, "
         f"{asset.report['paths_per_point']} rays for reflections from each point (`auto`): **{seconds:.1f} s** ({stages}); "
         f"direct light alone {direct_seconds:.1f} s, ratio {seconds / direct_seconds:.2f}.\n"
     )

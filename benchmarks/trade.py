@@ -20,7 +20,7 @@ from mi_prt.precompute import measure
 from mi_prt.scene.scene import open_scene
 
 ROOT = Path(__file__).resolve().parent.parent
-COEFFICIENTS = (4, 8, 16, 32, 48, 96, 192, 384)
+COEFFICIENTS = (16, 48, 96, 192, 384)
 SETTINGS = (("cubemap:16", 1), ("cubemap:32", 1), ("cubemap:32", 4))
 ANGLES = (0, 90, 180, 270)
 
