@@ -180,7 +180,7 @@ def speed(assets, pictures):
     yield "## Speed: bunny on a plane\n"
     started = time.perf_counter()
     content = bunny_on_plane(assets)
-    settings = {"directions": "cubemap:32", "rays_per_direction": 4, "coefficients": 448}
+    settings = {"directions": "cubemap:32", "rays_per_direction": 4, "coefficients": 512}
     asset, cost = measure(content, bounces=BOUNCES, **settings)
     seconds = time.perf_counter() - started
     started = time.perf_counter()
@@ -188,7 +188,7 @@ def speed(assets, pictures):
     direct_seconds = time.perf_counter() - started
     stages = ", ".join(f"{name} {value:.1f}" for name, value in cost["seconds"].items())
     yield (
-        f"{len(asset.points):,} points, `cubemap:32` with 4 rays in each cell, 448 coefficients, {BOUNCES} reflections, albedo 0.5, "
+        f"{len(asset.points):,} points, `cubemap:32` with 4 rays in each cell, 512 coefficients, {BOUNCES} reflections, albedo 0.5, "
         f"{asset.report['paths_per_point']} rays for reflections from each point (`auto`): **{seconds:.1f} s** ({stages}); "
         f"direct light alone {direct_seconds:.1f} s, ratio {seconds / direct_seconds:.2f}.\n"
     )
