@@ -112,6 +112,18 @@ def set_threads(count: int) -> None:
     _load("drjit").set_thread_count(count)
 
 
+@contextmanager
+def a_worker_at_least():
+    """Within the block Dr.Jit has a thread beside the calling one: Mitsuba hands the loading of images to it, and waits forever without."""
+    drjit = _load("drjit")
+    count = drjit.thread_count()
+    drjit.set_thread_count(max(count, 2))
+    try:
+        yield
+    finally:
+        drjit.set_thread_count(count)
+
+
 def thread_count() -> int:
     """How many CPU threads Mitsuba and Dr.Jit use, the calling thread included."""
     return _load("drjit").thread_count()

@@ -1,5 +1,9 @@
 """Scenes: what is refused and how, what of a material is modelled and what is named as left out, and what stays untouched."""
 
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -400,3 +404,14 @@ def test_the_hash_of_faceted_and_instanced_shapes(tmp_path):
         }
         moved.append(open_scene(scene(g={"type": "shapegroup", "s": sphere()}, i=instance)).hash)
     assert moved[0] != moved[1]
+
+
+def test_images_load_with_a_single_thread(tmp_path):
+    """Mitsuba hands them to a worker of Dr.Jit, and without one waited forever: in a process of its own, which would hang."""
+    root = Path(__file__).resolve().parent.parent
+    program = (
+        "import sys; from mi_prt.runtime import set_threads, thread_count; from mi_prt.scene.scene import open_scene; "
+        "set_threads(1); open_scene(sys.argv[1]); print(thread_count())"
+    )
+    command = [sys.executable, "-c", program, str(root / "scenes" / "cornell_sky.xml")]
+    assert subprocess.run(command, capture_output=True, text=True, timeout=120).stdout == "1\n"

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import SceneError
-from ..runtime import mitsuba
+from ..runtime import a_worker_at_least, mitsuba
 from .materials import Material, model_material
 from .traversal import children, digest_of, transform_of
 
@@ -239,7 +239,8 @@ def open_scene(source, parameters=None):
 def _loaded(what, load, *arguments, **parameters):
     # optimize=False keeps every shape what it is in the file; parallel=False avoids a known deadlock.
     try:
-        scene = load(*arguments, optimize=False, parallel=False, **parameters)
+        with a_worker_at_least():
+            scene = load(*arguments, optimize=False, parallel=False, **parameters)
     except Exception as error:  # Mitsuba raises RuntimeError, ValueError and others
         raise SceneError(f"Mitsuba rejects {what}: {' '.join(str(error).split())}") from None
     if not isinstance(scene, mitsuba().Scene):
