@@ -55,28 +55,18 @@ def point_irradiance(mi_scene, points, spp, seed=0):
 
     mi = mitsuba()
     spp += spp % 2
-    step = max(1, LANES // spp)
-    count = len(points)
-    means, errors = np.empty((count, 3)), np.empty((count, 3))
-    sampler = mi.load_dict({"type": "independent"})
-    per_point = dr.opaque(mi.UInt32, spp)
-    interaction = _interactions(mi_scene, points)
-    for block, first in enumerate(range(0, count, step)):
-        size = min(step, count - first)
-        sampler.seed(seed + block * 7919, size * spp)
-        lane = dr.arange(mi.UInt32, size * spp)
-        si = interaction(lane // per_point + dr.opaque(mi.UInt32, first))
+    means, errors = np.empty((len(points), 3)), np.empty((len(points), 3))
+    for block, sampler, si, number in _samples(mi_scene, points, spp, seed):
         place = sampler.next_2d()
-        place.x = (mi.Float(lane % per_point) + place.x) / mi.Float(per_point)
+        place.x = (mi.Float(number) + place.x) / mi.Float(dr.opaque(mi.UInt32, spp))
         sample, weight = mi_scene.sample_emitter_direction(si, place, True)
         value = _received(si, sample, weight)
         sums = [dr.block_sum(channel, spp) for channel in value]
         # The squared difference of samples of neighbouring strata is, in the mean, no less than the sum of their variances.
-        pairs = dr.arange(mi.UInt32, size * spp // 2) * 2
+        pairs = dr.arange(mi.UInt32, dr.width(number) // 2) * 2
         differences = [dr.gather(mi.Float, x, pairs) - dr.gather(mi.Float, x, pairs + 1) for x in value]
         squares = [dr.block_sum(x * x, spp // 2) for x in differences]
         dr.eval(sums, squares)
-        block = slice(first, first + size)
         means[block] = np.stack([np.array(x, dtype=np.float64) for x in sums], axis=-1) / spp
         errors[block] = np.sqrt(np.stack([np.array(x, dtype=np.float64) for x in squares], axis=-1)) / spp
     return Reference(means, errors)
@@ -122,22 +112,13 @@ def indirect_irradiance(mi_scene, points, spp, bounces=None, seed=0):
 
     mi = mitsuba()
     spp += spp % 2
-    count = len(points)
-    means, errors = np.zeros((count, 3)), np.zeros((count, 3))
+    means, errors = np.zeros((len(points), 3)), np.zeros((len(points), 3))
     if bounces == 0:
         return Reference(means, errors)
     # From the point on: one reflection less is on the way to what is seen from there.
     depth = path_depth(None if bounces is None else bounces - 1)
     integrator = mi.load_dict({"type": "path", "max_depth": depth})
-    step = max(1, LANES // spp)
-    sampler = mi.load_dict({"type": "independent"})
-    per_point = dr.opaque(mi.UInt32, spp)
-    interaction = _interactions(mi_scene, points)
-    for block, first in enumerate(range(0, count, step)):
-        size = min(step, count - first)
-        sampler.seed(seed + block * 7919, size * spp)
-        lane = dr.arange(mi.UInt32, size * spp)
-        si = interaction(lane // per_point + dr.opaque(mi.UInt32, first))
+    for block, sampler, si, _ in _samples(mi_scene, points, spp, seed):
         direction = si.sh_frame.to_world(mi.warp.square_to_cosine_hemisphere(sampler.next_2d()))
         ray = mi.RayDifferential3f(si.spawn_ray(direction))
         seen = mi_scene.ray_intersect(ray)
@@ -148,8 +129,8 @@ def indirect_irradiance(mi_scene, points, spp, bounces=None, seed=0):
         squares = [dr.block_sum(channel * channel, spp) for channel in value]
         dr.eval(sums, squares)
         mean, square = (np.stack([np.array(x, dtype=np.float64) for x in y], axis=-1) / spp for y in (sums, squares))
-        means[first : first + size] = mean
-        errors[first : first + size] = np.sqrt(np.maximum(square - mean**2, 0) / (spp - 1))
+        means[block] = mean
+        errors[block] = np.sqrt(np.maximum(square - mean**2, 0) / (spp - 1))
     return Reference(means, errors)
 
 
@@ -178,6 +159,23 @@ def local_irradiance(mi_scene, points, lights):
         lit = ~mi_scene.ray_test(si.spawn_ray_to(sample.p))
         total += np.array(_received(si, sample, weight) & lit).T
     return total
+
+
+def _samples(mi_scene, points, spp, seed):
+    """Blocks of samples: the slice of points, a sampler, Mitsuba's interactions, `spp` for each point, and the number of each there."""
+    import drjit as dr
+
+    mi = mitsuba()
+    step = max(1, LANES // spp)
+    sampler = mi.load_dict({"type": "independent"})
+    per_point = dr.opaque(mi.UInt32, spp)
+    interaction = _interactions(mi_scene, points)
+    for block, first in enumerate(range(0, len(points), step)):
+        size = min(step, len(points) - first)
+        sampler.seed(seed + block * 7919, size * spp)
+        lane = dr.arange(mi.UInt32, size * spp)
+        si = interaction(lane // per_point + dr.opaque(mi.UInt32, first))
+        yield slice(first, first + size), sampler, si, lane % per_point
 
 
 def _interactions(mi_scene, points):
