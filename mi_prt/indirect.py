@@ -65,8 +65,8 @@ class IndirectTransport:
     blocked: np.ndarray
     lanes: int
 
-    def demand(self):
-        """Find out what the scene calls for, by a few rays from some of its points; a Demand. Raises SceneError as `check_ending`."""
+    def _demand(self):
+        """Find out what the scene calls for, by a few rays from some of its points; a Demand."""
         settings = self.settings
         seeing = np.flatnonzero((self.blocked > 0) & ~self.buried)
         few = np.sort(np.random.default_rng(settings.seed).permutation(seeing)[:PILOT_POINTS])
@@ -97,12 +97,11 @@ class IndirectTransport:
         halves, _ = _unpacked(np.concatenate(list(sampler.blocks())), 1, self.direct.shape[1])
         return halves[:, 0]
 
-    def coefficients(self, demand, workspace, trace, progress):
+    def coefficients(self, workspace, trace, progress):
         """Coefficients of indirect transport.
 
         Parameters
         ----------
-        demand : Demand
         workspace : Workspace
             Keeps the rays.
         trace : callable(stage, sampler, rows)
@@ -116,7 +115,13 @@ class IndirectTransport:
         growth : float
             See `basis.total.fit_total`.
         report : dict
+
+        Raises
+        ------
+        SceneError
+            If any number of reflections is wanted and they do not end.
         """
+        demand = self._demand()
         halves, split = (self._solved if self.settings.indirect == "solve" else self._traced)(demand, workspace, trace, progress)
         if split.bounces == 0:
             return None, 0.0, direct_report(split.energy[0])

@@ -9,6 +9,7 @@ from .asset_file import coefficient_arrays
 from .basis.bases import coefficient_bytes, fit_bytes
 from .directions import parse_directions
 from .indirect import surface_shares
+from .indirect import GREY
 from .memory import resident_bytes
 from .parallel import BLOCK_ROWS, map_chunks
 from .points.points import POINT_BUDGET, sample_points
@@ -209,7 +210,7 @@ def _requirements(scene, points, rays):
         "albedo": {
             "mean": [round(float(x), 4) for x in albedo.mean(axis=0)],
             "largest": round(float(albedo.max()), 4),
-            "grey": bool(np.ptp(albedo, axis=1).max() < 1e-4),
+            "grey": bool(np.ptp(albedo, axis=1).max() <= GREY),
         },
         "distant_emitters": [e.class_name() for e in scene.distant_emitters],
         "local_emitters": [e.class_name() for e in scene.local_emitters],

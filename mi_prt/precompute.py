@@ -202,7 +202,7 @@ class _Compression:
                 self.scene, self.points, buried, transport, self.directions, self.settings, carried, direct, blocked, lanes
             )
             coefficients, growth, report = indirect.coefficients(
-                indirect.demand(), self.workspace, lambda *job: _trace(*job, self.progress), self.progress
+                self.workspace, lambda *job: _trace(*job, self.progress), self.progress
             )
             if coefficients is None:
                 return None

@@ -1,13 +1,15 @@
 """Assets of transport with reflections: colours, bases, errors told against errors found, settings, and pictures."""
 
 import json
+import warnings
 
 import numpy as np
 import pytest
 from conftest import NOTHING, bias, cube, diffuse, rectangle, relative_l2, sampled, scene, sky_of, uniform_sky
 
 import mi_prt
-from mi_prt import SettingsError
+from mi_prt import LightWarning, SceneError, SettingsError
+from mi_prt.provenance import open_scene_of
 from mi_prt.render.integrator import integrator_for
 from mi_prt.runtime import mitsuba
 from mi_prt.settings import Settings
@@ -309,3 +311,28 @@ def test_picture_is_that_of_the_path_tracer(pictured, opened):
     assert relative_l2(image[surface], expected[surface]) < 0.06
     if bounces != 0:
         assert bias(image[surface], by_path(2)[surface]) > 0.1
+
+
+def test_repainted_scene_is_told():
+    """Reflected light is that of the old paint; direct light has none, and where nothing is repainted there is nothing to say."""
+    asset = precompute(corner(0.8, [0.7, 0.3, 0.3]), edge_length=0.5, bounces=1, coefficients=8)
+    direct = precompute(corner(0.8, [0.7, 0.3, 0.3]), edge_length=0.5, bounces=0, coefficients=8)
+    repainted = corner(0.8, [0.3, 0.3, 0.7])
+    with pytest.warns(LightWarning, match="materials changed"):
+        open_scene_of(asset, repainted)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        open_scene_of(asset, corner(0.8, [0.7, 0.3, 0.3]))
+        open_scene_of(direct, repainted)
+
+
+@pytest.mark.parametrize("indirect", ["solve", "paths"])
+def test_reflections_that_need_not_end_are_refused(indirect):
+    """An albedo of 1.3 makes light; a number of bounces says how much."""
+    bright = mitsuba().Bitmap(np.full((2, 2, 3), 1.3, np.float32))
+    bsdf = {"type": "diffuse", "reflectance": {"type": "bitmap", "bitmap": bright, "raw": True}}
+    parts = scene(floor=rectangle(bsdf=bsdf), box=cube((0, 0.4, 0), 0.3, bsdf=bsdf))
+    with pytest.raises(SceneError, match="reflects 1.3 times"):
+        precompute(parts, indirect=indirect, bounces="auto", edge_length=0.5)
+    energy = precompute(parts, indirect=indirect, bounces=2, edge_length=0.5).report["bounce_energy"]
+    assert len(energy) == 3 and np.isfinite(energy).all()

@@ -58,6 +58,7 @@ class Hops:
 
     def largest_albedo(self):
         """The largest albedo, in any channel, of what is seen."""
+
         def largest(first):
             rays = self._read(first)
             return rays["albedo"].max(axis=-1, where=(rays["point"] != NOTHING)[..., None], initial=0.0).max(initial=0.0)

@@ -83,7 +83,10 @@ def split_by_bounces(hops, direct, weights, channels, bounces=None):
         term = hops.apply(term)
         energy.append(_mean(term, weights))
         if not np.isfinite(energy[-1]):
-            raise SceneError(f"light grows without bound after {len(energy) - 1} reflections: a surface of albedo {albedo:.4g} reflects more than arrives")
+            raise SceneError(
+                f"light grows without bound within {len(energy) - 1} reflections: a surface reflects {albedo:.4g} times the light that arrives at "
+                "it; correct its reflectance, or use fewer bounces (--bounces)"
+            )
         # A reflection leaves at most the largest albedo of the flux that arrives at all surfaces, and a mean weighted by area is flux.
         # Where that is nearly all, the bound is of no use, and what all reflections come to is solved for.
         bound = energy[-1] * albedo / (1 - albedo) if albedo < 1 else np.inf
@@ -122,14 +125,14 @@ def solve(hops, direct, channels, split, progress=lambda done: None):
     progress : callable(done)
         Called with the columns that are done.
 
+    Returns
+    -------
+    (c, n, m) float32
+
     Raises
     ------
     SceneError
         If all reflections are wanted and they do not end.
-
-    Returns
-    -------
-    (c, n, m) float32
     """
     n, m = direct.shape
     operators = [] if split is None else [hops.thinned(factor) for factor in _thinning(split, hops.count)]
