@@ -25,13 +25,15 @@ from .errors import (  # noqa: E402
 )
 from .evaluate.compare import compare  # noqa: E402
 from .lighting.environment import EnvironmentMap, LightWarning  # noqa: E402
-from .lighting.light import DirectionalLight, Light, PointLight  # noqa: E402
+from .lighting.light import DirectionalLight, Light  # noqa: E402
+from .lighting.local_lights import AreaLight, PointLight, SpotLight  # noqa: E402
 from .precompute import precompute  # noqa: E402
 from .relight import relight_to_file  # noqa: E402
 from .render.integrator import register_integrator  # noqa: E402
 
 __version__ = "0.2.0"
 __all__ = [
+    "AreaLight",
     "Asset",
     "AssetError",
     "DirectionalLight",
@@ -45,6 +47,7 @@ __all__ = [
     "RuntimeSetupError",
     "SceneError",
     "SettingsError",
+    "SpotLight",
     "compare",
     "load",
     "precompute",

@@ -10,7 +10,7 @@ import numpy as np
 from . import asset_file
 from .lighting.environment import LightWarning
 from .lighting.light import as_light
-from .lighting.local import arrival, hull_warning
+from .lighting.local import arrival, hull_warning, refuse_all_but_point_lights
 from .parallel import BLOCK_ROWS, map_chunks, one_blas_thread
 from .points.points import Points
 
@@ -60,14 +60,21 @@ class Asset:
         Parameters
         ----------
         light : Light or what `as_light` accepts
-            Local lights in it are left aside: at each point they are another light.
+            Point lights in it are left aside: at each point they are another light.
 
         Returns
         -------
         coefficients : (d, 3) float32
         mean_response : (3,) float32
+
+        Raises
+        ------
+        LightError
+            If there are local lights other than point lights.
         """
-        return self.basis.project(as_light(light).distant, self.directions)
+        light = as_light(light)
+        refuse_all_but_point_lights(light)
+        return self.basis.project(light.distant, self.directions)
 
     def prepare_light(self, light):
         """The same light in a form that turns in milliseconds.

@@ -34,7 +34,7 @@ def cell_radiance(light, directions, samples_per_side=SAMPLES_PER_CELL_SIDE):
         If there are local lights.
     """
     light = as_light(light)
-    if light.point_lights:
+    if not light.local.is_empty:
         raise LightError("a local light shines from another direction at each point: pass it to Asset.irradiance or relight")
     radiance = np.zeros((len(directions), 3))
     spacing = np.sqrt(4 * np.pi / len(directions)) / samples_per_side

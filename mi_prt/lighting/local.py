@@ -9,6 +9,8 @@ between x and p: that is the same only where the light is outside the convex hul
 
 import numpy as np
 
+from ..errors import LightError
+
 NAMED_LIGHTS = 3  # places that a warning names
 
 
@@ -49,6 +51,15 @@ def arrival(light, positions, directions, nearest=1):
     irradiance[here] = 0
     cells = directions.nearest(toward, nearest)
     return cells, np.minimum(irradiance, np.finfo(np.float32).max).astype(np.float32)
+
+
+def refuse_all_but_point_lights(light):
+    """Raise a LightError if a Light holds local lights that distant transport cannot be lit by: any but point lights."""
+    others = {"spot": light.spot_lights, "area": light.area_lights, "emission of the scene": light.emissions}
+    found = " and ".join(f"{len(lights)} {kind} light(s)" for kind, lights in others.items() if lights)
+    if found:
+        raise LightError(f"of local lights, transport of distant light takes point lights only, got {found}: precompute the "
+                         "scene with points='samples', or use point lights outside of it")
 
 
 def hull_warning(lights, hull):

@@ -4,9 +4,21 @@ import re
 
 from ..errors import LightError, SettingsError
 from .environment import EnvironmentMap
-from .light import DirectionalLight, PointLight
+from .light import DirectionalLight
+from .local_lights import AreaLight, PointLight, SpotLight
 
-FORMS = "scene (its own), point:x,y,z:r,g,b, directional:dx,dy,dz:r,g,b (direction of travel), envmap:FILE or envmap:FILE:AXIS:DEGREES"
+FORMS = (
+    "scene (its own), point:x,y,z:r,g,b, spot:x,y,z:dx,dy,dz:r,g,b[:cutoff[:beam]] (direction of travel, degrees), "
+    "area:x,y,z:ux,uy,uz:vx,vy,vz:r,g,b[:samples] (centre, edges), directional:dx,dy,dz:r,g,b (direction of travel), "
+    "envmap:FILE or envmap:FILE:AXIS:DEGREES"
+)
+# Class, number of vectors before the strength, and the types of what may follow it.
+_NUMERIC = {
+    "point": (PointLight, 1, ()),
+    "spot": (SpotLight, 2, (float, float)),
+    "area": (AreaLight, 3, (int,)),
+    "directional": (DirectionalLight, 1, ()),
+}
 _TURNED_FILE = re.compile(r"(.+?):([xyz]|[^:,]+,[^:,]+,[^:,]+):([^:]+)")
 
 
@@ -16,13 +28,20 @@ def parse_light(text):
     Parameters
     ----------
     text : str
-        ``scene`` (the scene's own distant light), ``point:x,y,z:r,g,b`` with the intensity in W/sr, ``directional:dx,dy,dz:r,g,b`` with the direction in which the
-        light travels and the irradiance in W/m², ``envmap:FILE`` or ``envmap:FILE:AXIS:DEGREES``. A single number in the
-        place of r,g,b is grey.
+        - ``scene``: the scene's own light
+        - ``point:x,y,z:r,g,b`` with the intensity in W/sr
+        - ``spot:x,y,z:dx,dy,dz:r,g,b``, then ``:cutoff`` and ``:beam`` in degrees if need be, with the direction in which the
+          light travels and the intensity in W/sr
+        - ``area:x,y,z:ux,uy,uz:vx,vy,vz:r,g,b``, then ``:samples`` if need be, with the centre, both edges, and the radiance in
+          W/(m² sr)
+        - ``directional:dx,dy,dz:r,g,b`` with the direction in which the light travels and the irradiance in W/m²
+        - ``envmap:FILE`` or ``envmap:FILE:AXIS:DEGREES``
+
+        A single number in the place of r,g,b is grey.
 
     Returns
     -------
-    PointLight, DirectionalLight, EnvironmentMap or 'scene'
+    PointLight, SpotLight, AreaLight, DirectionalLight, EnvironmentMap or 'scene'
 
     Raises
     ------
@@ -35,13 +54,11 @@ def parse_light(text):
     try:
         if kind == "envmap" and rest:
             return _environment(rest)
-        if kind in ("point", "directional"):
-            vector, strength = (_numbers(part) for part in rest.split(":"))
-            strength = strength[0] if len(strength) == 1 else strength
-            return PointLight(vector, strength) if kind == "point" else DirectionalLight(vector, strength)
+        if kind in _NUMERIC:
+            return _numeric(*_NUMERIC[kind], rest.split(":"))
     except (LightError, SettingsError) as error:
         raise LightError(f"light '{text}': {error}") from None
-    except ValueError:  # not numbers, or not two parts
+    except ValueError:  # not numbers, or not as many parts
         pass
     raise LightError(f"light '{text}' is not of the form {FORMS}")
 
@@ -72,6 +89,16 @@ def parse_rotation(text):
         return vector, float(degrees)
     except ValueError:
         raise SettingsError(f"rotation '{text}' is not of the form AXIS:DEGREES, for example y:30 or 0,1,1:30") from None
+
+
+def _numeric(light, vectors, options, parts):
+    """A light of some vectors, its strength, and numbers that may be left out at the end."""
+    if not vectors < len(parts) <= vectors + 1 + len(options):
+        raise ValueError
+    strength = _numbers(parts[vectors])
+    strength = strength[0] if len(strength) == 1 else strength
+    rest = (number(part) for number, part in zip(options, parts[vectors + 1 :]))
+    return light(*map(_numbers, parts[:vectors]), strength, *rest)
 
 
 def _environment(text):

@@ -1,14 +1,17 @@
-"""Between Mitsuba's emitters and this program's light: the distant light of a scene, and a scene under other light."""
+"""Between Mitsuba's emitters and this program's light: the distant light of a scene, and a scene under other light.
+
+Its local light is in `local_emitters`."""
 
 import numpy as np
 import scipy.ndimage
 
 from ..errors import LightError
 from ..runtime import mitsuba
-from ..scene.scene import rebuilt_scene
+from ..scene.scene import is_dark, rebuilt_scene
 from ..scene.traversal import children, transform_of
 from .environment import EnvironmentMap
 from .light import DirectionalLight, Light, as_light
+from .local_emitters import local_scene_light
 
 SCENE = "scene"  # the scene's own distant light, in a list of lights
 BAKED_HEIGHT = 512  # rows of the map that an analytic sky is baked to
@@ -58,18 +61,30 @@ def emitters_light(emitters):
     return Light(tuple(maps), tuple(directionals))
 
 
-def lit_scene(mi_scene, light=None):
+def lit_scene(mi_scene, light=None, keep_local=True):
     """The same shapes and sensors as a new mi.Scene under other light, with watertight intersections.
+
+    An area light becomes a rectangle that reflects nothing. It is a shape like others then: it blocks light, which
+    the area light of this program does not, and is seen in pictures.
 
     Parameters
     ----------
     mi_scene : mi.Scene
     light : what `as_light` accepts, optional
-        Takes the place of the scene's distant emitters; by default they stay. Local emitters of the scene stay in any case.
+        Takes the place of the scene's distant emitters; by default they stay.
+    keep_local : bool
+        Whether the scene's local emitters stay. Shapes stay in any case, and with them emitters on them: to leave out local
+        emitters, pass a scene in which those are dark, as `Scene.modelled` and `Scene.unlit` are.
 
     Returns
     -------
     mi.Scene
+
+    Raises
+    ------
+    LightError
+        If the light has emissions (they stand for emitters of a scene, which are kept in it instead), or a shape shines
+        that should not.
 
     Notes
     -----
@@ -78,9 +93,13 @@ def lit_scene(mi_scene, light=None):
     mi = mitsuba()
     kept = []
     for _, child in children(mi_scene):
-        is_light = isinstance(child, mi.Emitter)
-        replaced = is_light and light is not None and mi.has_flag(child.flags(), mi.EmitterFlags.Infinite)
-        if isinstance(child, mi.Shape | mi.Sensor) or (is_light and not replaced):
+        if isinstance(child, mi.Emitter):
+            stays = light is None if mi.has_flag(child.flags(), mi.EmitterFlags.Infinite) else keep_local
+        else:
+            stays = isinstance(child, mi.Shape | mi.Sensor)
+            if isinstance(child, mi.Shape) and child.is_emitter() and not keep_local and not is_dark(child.emitter()):
+                raise LightError(f"shape '{child.id()}' shines: to leave out local light, pass what Scene.unlit or modelled gives")
+        if stays:
             kept.append(child)
     return rebuilt_scene(kept, None if light is None else _emitters(as_light(light)))
 
@@ -112,8 +131,32 @@ def turned_light(scene, light=None, rotate=None):
     return (None if light is None and rotate is None else chosen), chosen
 
 
+def chosen_local_light(scene, light=None):
+    """The local light to show a scene in.
+
+    Parameters
+    ----------
+    scene : Scene or None
+        Whose own local light is taken where `light` is None, or in the place of 'scene' in a list; not needed otherwise.
+    light : what `as_light` accepts, or a list of such and 'scene', optional
+
+    Returns
+    -------
+    shown : Light
+        What is shown beside the scene's own emitters; with the next, what `lit_scene` takes.
+    keep_local : bool
+        Whether the scene's own emitters shine.
+    chosen : Light
+        What the asset is lit by: the sum of both.
+    """
+    keep_local = is_of_scene(light)
+    others = [part for part in _listed(light) if not is_of_scene(part)]
+    shown = as_light(others) if others or not keep_local else Light()
+    return shown, keep_local, as_light([shown, local_scene_light(scene)]) if keep_local else shown
+
+
 def is_of_scene(light):
-    """Whether a light, as `turned_light` takes it, contains the scene's own."""
+    """Whether a light, as `turned_light` and `chosen_local_light` take it, contains the scene's own."""
     return any(part is None or (isinstance(part, str) and part == SCENE) for part in _listed(light))
 
 
@@ -159,6 +202,8 @@ def _is_alike(one, other):
 
 def _emitters(light):
     """Mitsuba emitter dicts of a Light."""
+    if light.emissions:
+        raise LightError("emission of a scene's own emitters has no emitter of its own: keep those of the scene, keep_local")
     mi = mitsuba()
     emitters = {}
     if light.maps:
@@ -178,6 +223,10 @@ def _emitters(light):
         }
     for i, source in enumerate(light.point_lights):
         emitters[f"point{i}"] = point_emitter(source)
+    for i, source in enumerate(light.spot_lights):
+        emitters[f"spot{i}"] = _spot_emitter(source)
+    for i, source in enumerate(light.area_lights):
+        emitters[f"area{i}"] = _area_emitter(source)
     return emitters
 
 
@@ -187,6 +236,30 @@ def point_emitter(light):
         "type": "point",
         "position": [float(x) for x in light.position],
         "intensity": _spectrum(light.intensity),
+    }
+
+
+def _spot_emitter(light):
+    mi = mitsuba()
+    aside = np.eye(3)[np.argmin(np.abs(light.direction))]
+    to_world = mi.ScalarTransform4f().look_at(list(light.position), list(light.position + light.direction), list(aside))
+    return {
+        "type": "spot",
+        "to_world": to_world,
+        "intensity": _spectrum(light.intensity),
+        "cutoff_angle": light.cutoff_degrees,
+        "beam_width": light.beam_degrees,
+    }
+
+
+def _area_emitter(light):
+    to_world = np.eye(4)
+    to_world[:3] = np.stack([light.edge_u / 2, light.edge_v / 2, light.normal, light.centre], axis=-1)
+    return {
+        "type": "rectangle",
+        "to_world": mitsuba().ScalarTransform4f(to_world),
+        "emitter": {"type": "area", "radiance": _spectrum(light.radiance)},
+        "bsdf": {"type": "diffuse", "reflectance": _spectrum([0, 0, 0])},
     }
 
 

@@ -170,21 +170,28 @@ class Scene:
             "vertices": sum(m.vertex_count() for m in meshes),
         }
 
-    def modelled(self):
-        """The scene that the transport stands for: diffuse reflection only, local emitters dark.
+    def modelled(self, keep_local=False):
+        """The scene that the transport stands for: diffuse reflection only, local emitters dark or, with `keep_local`, as they are.
 
         Returns
         -------
         mi.Scene
-            A fresh scene; this one is left as it is.
+            A fresh scene where something has to be changed; this one is left as it is.
 
         Raises
         ------
         SceneError
             If the scene was given as an mi.Scene and would have to be changed.
         """
-        changed = [i for i, s in enumerate(self.surfaces) if s.material.left_out]
-        if not changed and not self.local_emitters:
+        return self._changed([i for i, s in enumerate(self.surfaces) if s.material.left_out], keep_local)
+
+    def unlit(self):
+        """The scene as written, but for its local emitters, which are dark; see `modelled`."""
+        return self._changed([], keep_local=False)
+
+    def _changed(self, replaced, keep_local):
+        """The scene with the modelled materials on some surfaces, and local emitters kept or dark."""
+        if not replaced and (keep_local or not self.local_emitters):
             return self.mi_scene
         if self.source.kind == "object" or _holds_objects(self.source.content):
             raise SceneError(
@@ -192,9 +199,9 @@ class Scene:
                 "pass its path or dict, or compare with reference 'full'"
             )
         copy = open_scene(self.source.path or self.source.content, self.source.parameters)
-        for i in changed:
+        for i in replaced:
             copy.surfaces[i].shape.set_bsdf(copy.surfaces[i].material.modelled)
-        for emitter in copy.local_emitters:
+        for emitter in () if keep_local else copy.local_emitters:
             _darken(emitter)
         return copy.mi_scene
 
@@ -337,9 +344,20 @@ def _is_appearance(key):
     return key.startswith(("vertex_", "face_")) and key not in ("vertex_positions", "vertex_normals")
 
 
+def is_dark(emitter):
+    """Whether an emitter sends no light."""
+    parameters = mitsuba().traverse(emitter)
+    return not any(np.any(np.array(parameters[key])) for key in _emitted(parameters) if key != "sampling_weight")
+
+
 def _darken(emitter):
     parameters = mitsuba().traverse(emitter)
-    for key in parameters.keys():  # SceneParameters iterates over pairs
-        if key.split(".")[0] in ("radiance", "intensity", "irradiance", "sampling_weight") and "to_uv" not in key:
-            parameters[key] = parameters[key] * 0
+    for key in _emitted(parameters):
+        parameters[key] = parameters[key] * 0
     parameters.update()
+
+
+def _emitted(parameters):
+    """Keys of what an emitter's light is proportional to, and of how often it is sampled."""
+    kinds = ("radiance", "intensity", "irradiance", "sampling_weight")
+    return [key for key in parameters.keys() if key.split(".")[0] in kinds and "to_uv" not in key]  # it iterates over pairs
