@@ -5,6 +5,7 @@ import numpy as np
 from ..errors import SceneError
 from ..runtime import mitsuba
 from ..scene.scene import mesh_arrays
+from ..scene.surface_table import SurfaceTable
 from .tessellate import TESSELLATED_SHAPES
 
 NO_PATCH = 0xFFFFFFFF
@@ -39,35 +40,28 @@ class PatchLocator:
         self._back = mi.UInt32(patches.back.astype(np.uint32))
 
     def _match(self, scene, points):
-        """Fill the tables that lead from (shape, instance, primitive) to patches."""
-        import drjit as dr
-
+        """Fill the tables that lead from (surface, primitive) to patches."""
         mi = mitsuba()
         faces = _FaceIndex(points)
         analytic = {s["signature"]: s["first_patch"] for s in points.surfaces}
-        tables, starts, total = [], {}, 0
+        tables, starts, total = [np.empty(0, np.int64)], [], 0
         for surface in scene.surfaces:
-            if surface.kind == "mesh":
-                patch = faces.take(surface)
-            elif surface.kind in TESSELLATED_SHAPES:
-                patch = np.array([analytic.get(surface.signature, NO_PATCH)])
-            else:
-                patch = np.array([NO_PATCH])
+            if surface.kind not in TESSELLATED_SHAPES:
+                starts.append(NO_PATCH)
+                continue
+            known = surface.kind != "mesh"
+            patch = np.array([analytic.get(surface.signature, NO_PATCH)]) if known else faces.take(surface)
             missing = int((patch == NO_PATCH).sum())
-            if missing and surface.kind in TESSELLATED_SHAPES:
+            if missing:
                 raise SceneError(
                     f"shape '{surface.name}' has {missing} faces that the asset does not know: "
                     "the scene's geometry changed since it was precomputed; precompute it again"
                 )
-            starts[_registry_id(surface.instance), _registry_id(surface.shape)] = total
+            starts.append(total)
             tables.append(patch)
             total += len(patch)
-        shape_count = max(shape for _, shape in starts) + 1
-        lookup = np.full((max(instance for instance, _ in starts) + 1) * shape_count, NO_PATCH)
-        for (instance, shape), start in starts.items():
-            lookup[instance * shape_count + shape] = start
-        self._shape_count = dr.opaque(mi.UInt32, shape_count)
-        self._starts = mi.UInt32(lookup.astype(np.uint32))
+        self._surfaces = SurfaceTable(scene.surfaces)
+        self._starts = mi.UInt32(np.array(starts, np.uint32))
         self._patch = mi.UInt32(np.concatenate(tables).astype(np.uint32))
 
     def locate(self, pi, si, active):
@@ -91,9 +85,7 @@ class PatchLocator:
         import drjit as dr
 
         mi = mitsuba()
-        shape = dr.reinterpret_array(mi.UInt32, si.shape)
-        instance = dr.reinterpret_array(mi.UInt32, si.instance)
-        start = dr.gather(mi.UInt32, self._starts, instance * self._shape_count + shape, active)
+        start = dr.gather(mi.UInt32, self._starts, self._surfaces.index(si, active), active)
         found = active & (start != NO_PATCH)
         patch = dr.gather(mi.UInt32, self._patch, start + pi.prim_index, found)
         found &= patch != NO_PATCH
@@ -181,10 +173,3 @@ def _corner_keys(corners):
     """One comparable key (f,) for the exact float32 positions (f, 3, 3) of each face's corners."""
     exact = np.ascontiguousarray(corners.reshape(-1, 9) + np.float32(0))  # −0 becomes +0
     return exact.view(np.dtype((np.void, 36))).ravel()
-
-
-def _registry_id(node):
-    import drjit as dr
-
-    mi = mitsuba()
-    return 0 if node is None else int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(node))[0])

@@ -109,6 +109,49 @@ def modelled_bsdf(si, surfaces):
     return bsdf
 
 
+@dataclass
+class Facing:
+    """Unit normals of hits on the side that a ray comes from.
+
+    Parameters
+    ----------
+    geometric, shading : mi.Normal3f
+    """
+
+    geometric: object
+    shading: object
+
+
+def facing(si, ray, surfaces):
+    """The side of surfaces that rays meet, told by the faces and not by smooth normals.
+
+    A smooth normal can turn away from a ray that comes from the outer side of the face. Mitsuba's own materials are black there, which
+    loses energy; here such a hit reflects.
+
+    Parameters
+    ----------
+    si : mi.SurfaceInteraction3f
+    ray : mi.Ray3f
+    surfaces : sequence of Surface
+
+    Returns
+    -------
+    normals : Facing
+    wi : mi.Vector3f
+        Toward the ray's origin as a local direction, the side that is met being all that counts.
+    reflects : mi.Bool
+        Whether that side does.
+    """
+    import drjit as dr
+
+    mi = mitsuba()
+    outer = dr.mulsign(si.n, dr.dot(si.n, si.sh_frame.n))
+    side = dr.select(dr.dot(outer, ray.d) < 0, mi.Float(1), -1)
+    bsdf = modelled_bsdf(si, surfaces)
+    reflects = (side > 0) | mi.has_flag(bsdf.flags(), mi.BSDFFlags.BackSide)
+    return Facing(outer * side, si.sh_frame.n * side), mi.Vector3f(0, 0, side), reflects
+
+
 def _model(bsdf, left_out):
     mi = mitsuba()
     kind = bsdf.class_name()

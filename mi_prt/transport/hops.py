@@ -15,7 +15,7 @@ import scipy.sparse
 from ..parallel import BLOCK_ROWS, map_chunks
 from ..points.locate import PatchLocator
 from ..runtime import mitsuba
-from ..scene.materials import modelled_bsdf, reflectance_at
+from ..scene.materials import facing, reflectance_at
 from .direct import LANES, RAY_OFFSET
 
 NOTHING = 0xFFFFFFFF  # in the place of a point: what is seen reflects nothing, or nothing that is known
@@ -211,49 +211,6 @@ class HopSampler:
         for channel, values in enumerate(albedo):
             hops["albedo"][:, channel] = np.array(values)
         return hops.reshape(len(index), self._rays)
-
-
-@dataclass
-class Facing:
-    """Unit normals of hits on the side that a ray comes from.
-
-    Parameters
-    ----------
-    geometric, shading : mi.Normal3f
-    """
-
-    geometric: object
-    shading: object
-
-
-def facing(si, ray, surfaces):
-    """The side of surfaces that rays meet, told by the faces and not by smooth normals.
-
-    A smooth normal can turn away from a ray that comes from the outer side of the face. Mitsuba's own materials are black there, which
-    loses energy; here such a hit reflects.
-
-    Parameters
-    ----------
-    si : mi.SurfaceInteraction3f
-    ray : mi.Ray3f
-    surfaces : sequence of Surface
-
-    Returns
-    -------
-    normals : Facing
-    wi : mi.Vector3f
-        Toward the ray's origin as a local direction, the side that is met being all that counts.
-    reflects : mi.Bool
-        Whether that side does.
-    """
-    import drjit as dr
-
-    mi = mitsuba()
-    outer = dr.mulsign(si.n, dr.dot(si.n, si.sh_frame.n))
-    side = dr.select(dr.dot(outer, ray.d) < 0, mi.Float(1), -1)
-    bsdf = modelled_bsdf(si, surfaces)
-    reflects = (side > 0) | mi.has_flag(bsdf.flags(), mi.BSDFFlags.BackSide)
-    return Facing(outer * side, si.sh_frame.n * side), mi.Vector3f(0, 0, side), reflects
 
 
 def blocked_share(transport, solid_angles):

@@ -11,9 +11,9 @@ import scipy.sparse
 
 from ..parallel import BLOCK_ROWS, map_chunks
 from ..runtime import mitsuba
-from ..scene.materials import reflectance_at
+from ..scene.materials import facing, reflectance_at
 from .direct import LANES, RAY_OFFSET
-from .hops import NOTHING, facing
+from .hops import NOTHING
 
 ROULETTE_FROM = 3  # reflections after which a path may end by chance
 MOST_LIKELY = 0.95  # probability of going on: below 1, so that paths end between white walls too
