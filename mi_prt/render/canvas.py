@@ -133,13 +133,18 @@ def open_canvas(width, height):
     SettingsError
         If the size is above OpenGL's limit.
     """
+    check_size(width, height)
+    return _Canvas(width, height)
+
+
+def check_size(width, height):
+    """Raise SettingsError if an image of a size in samples is above OpenGL's limit; what it raises else, see `open_canvas`."""
     make_current()
-    limit = GL.glGetIntegerv(GL.GL_MAX_RENDERBUFFER_SIZE)
+    limit = min(GL.glGetIntegerv(GL.GL_MAX_RENDERBUFFER_SIZE), GL.glGetIntegerv(GL.GL_MAX_TEXTURE_SIZE))
     if max(width, height) > limit:
         raise SettingsError(
             f"a raster image of {width}x{height} samples is above OpenGL's limit of {limit} a side: make it smaller"
         )
-    return _Canvas(width, height)
 
 
 def draw(canvas, drawn):

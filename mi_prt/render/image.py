@@ -66,7 +66,7 @@ def resized(sensor, size):
     if min(width, height) < 1 or width * height > MAX_PIXELS:
         raise SettingsError(f"image size {width}x{height} must be at least 1x1 and at most {MAX_PIXELS:,} pixels")
     parameters = mitsuba().traverse(sensor)
-    before = {key: parameters[key] for key in ("film.size", "film.crop_size", "film.crop_offset")}
+    before = {key: list(parameters[key]) for key in ("film.size", "film.crop_size", "film.crop_offset")}
     parameters["film.size"] = parameters["film.crop_size"] = [width, height]
     parameters["film.crop_offset"] = [0, 0]
     parameters.update()

@@ -18,11 +18,10 @@ import numpy as np
 from ..errors import SceneError, SettingsError
 from ..points.lattice import lattice_nodes, lattice_triangles
 from ..runtime import mitsuba
-from ..scene.traversal import transform_of
 from .canvas import draw, drawing, make_current, new_primitive, open_canvas
 from .display import display
+from .view import view_of
 
-SENSORS = {"PerspectiveCamera": "perspective", "ThinLensCamera": "thinlens", "OrthographicCamera": "orthographic"}
 MIN_TEXELS, MAX_TEXELS = 512, 4096  # along a side of a baked texture
 PROCEDURAL_TEXELS = 256  # along a period of a texture that is no bitmap
 BURIED_WEIGHT = 1e-5  # of buried points in interpolation: nothing beside others, all where there are no others
@@ -86,7 +85,7 @@ class RasterScene:
         if samples < 1:
             raise SettingsError(f"samples must be ≥ 1 along each side of a pixel, got {samples}")
         _check_surfaces(scene, asset.points)
-        self._view = _view_of(sensor)
+        self._view = view_of(sensor)
         self._scene, self._samples = scene, samples
         self._weight = np.where(asset.buried, np.float32(BURIED_WEIGHT), np.float32(1))[:, None]
         self._reflection, self._emission, albedo = _shading(scene, asset.points)
@@ -154,67 +153,6 @@ class RasterScene:
             self._sky = dr.zeros(mitsuba().SurfaceInteraction3f, len(row))
             self._sky.wi = mitsuba().Vector3f(-directions.T.astype(np.float32))
         drawn[uncovered, :3] = _rgb(environment.eval(self._sky), uncovered.sum())
-
-
-# --- the sensor ----------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, eq=False)
-class _View:
-    """Where a sensor puts the world. Positions in the image go from (0, 0), upper left, to (1, 1), lower right.
-
-    Parameters
-    ----------
-    size : (width, height)
-    to_clip : (4, 4) float64
-        World to OpenGL's clip space.
-    eye : (4,)
-        Position of the viewer; for parallel rays the direction to it, with w = 0.
-    depth : (4,)
-        Dot product with a position (x, y, z, 1): 0 at the near plane, 1 at the far plane.
-    """
-
-    size: tuple
-    to_clip: np.ndarray
-    eye: np.ndarray
-    depth: np.ndarray
-
-    def directions(self, x, y):
-        """Unit directions (k, 3) of rays through positions x, y (k,) in the image."""
-        ones = np.ones_like(x)
-        far = np.linalg.solve(self.to_clip, [2 * x - ones, ones - 2 * y, ones, ones])
-        directions = (far[:3] / far[3] - self.eye[:3, None] if self.eye[3] else -self.eye[:3, None] * ones).T
-        return directions / np.linalg.norm(directions, axis=1, keepdims=True)
-
-
-def _view_of(sensor):
-    """The view of a sensor, from its own rays through two corners of the image."""
-    kind = sensor.class_name()
-    if kind not in SENSORS:
-        raise SettingsError(f"the raster renderer draws {', '.join(SENSORS.values())} sensors, not {kind}: use mitsuba")
-    if kind == "ThinLensCamera":
-        warnings.warn("the raster renderer draws a thinlens sensor as a pinhole, all in focus", stacklevel=3)
-    mi = mitsuba()
-    to_world = transform_of(sensor)
-    to_camera = np.linalg.inv(to_world)
-    corners = sensor.sample_ray(0.0, 0.5, mi.Point2f([0, 1], [0, 1]), mi.Point2f(0.5))[0]
-    near, far = sensor.near_clip(), sensor.far_clip()
-    # In Mitsuba's camera space, x to the left, y up, and z forward. Clip space is x to the right, -1 to 1 times w.
-    projection = np.zeros((4, 4))
-    if kind == "OrthographicCamera":
-        (x0, x1), (y0, y1), _ = to_camera[:3, :3] @ np.array(corners.o, np.float64) + to_camera[:3, 3:]
-        eye, centre = -to_world[:, 2], 3
-        projection[2:] = [[0, 0, 2, -far - near], [0, 0, 0, far - near]]
-    else:
-        x, y, z = to_camera[:3, :3] @ np.array(corners.d, np.float64)
-        (x0, x1), (y0, y1) = x / z, y / z
-        eye, centre = to_world[:, 3], 2
-        projection[2:] = [[0, 0, far + near, -2 * far * near], [0, 0, far - near, 0]]
-    projection[2:] /= far - near
-    projection[0, [0, centre]] = np.array([2, -x0 - x1]) / (x1 - x0)
-    projection[1, [1, centre]] = np.array([2, -y0 - y1]) / (y0 - y1)
-    depth = np.array([0, 0, 1, -near]) / (far - near) @ to_camera
-    return _View(tuple(map(int, sensor.film().crop_size())), projection @ to_camera, eye, depth)
 
 
 # --- triangles and what they reflect -------------------------------------------------------------------------------
