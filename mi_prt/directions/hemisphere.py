@@ -1,0 +1,137 @@
+"""Directions over a hemisphere, on a grid that is looked up in closed form.
+
+The unit square is mapped to the disk by Shirley and Chiu's concentric map and from there to the hemisphere, both with equal area: the
+cells of a grid have equal solid angles, neighbours in the grid are neighbours on the hemisphere, and the four directions around any
+other one are found without a search.
+"""
+
+import numpy as np
+
+from ..errors import SettingsError
+from ..runtime import mitsuba
+
+LEAST, MOST = 16, 1 << 16
+_SKEW = 1.5  # between the sides of the grid, at most
+
+
+class Hemisphere:
+    """A grid of directions over the hemisphere around z.
+
+    Parameters
+    ----------
+    count : int
+        Directions: a product of two numbers that differ by half at most, such as 2016 = 42·48.
+
+    Attributes
+    ----------
+    rows, columns : int
+    vectors : (count, 3) float32
+        Unit vectors, row by row. Each stands for 2π/count sr.
+    weights : (count,) float32
+        Share of each direction's cosine-weighted solid angle in that of all.
+
+    Raises
+    ------
+    SettingsError
+        If the count is out of range or no such product; with the nearest that are.
+    """
+
+    def __init__(self, count):
+        sides = _sides(count) if LEAST <= count <= MOST else None
+        if sides is None:
+            fitting = sorted((c for c in range(LEAST, MOST + 1) if _sides(c)), key=lambda c: abs(c - count))[:2]
+            raise SettingsError(
+                f"{count} depth directions make no grid with sides of about the same length: take {' or '.join(map(str, sorted(fitting)))}"
+            )
+        self.rows, self.columns = sides
+        j, i = np.indices(sides).reshape(2, -1)
+        x, y = (i + 0.5) / self.columns, (j + 0.5) / self.rows
+        self.vectors = _to_hemisphere(x, y).astype(np.float32)
+        self.weights = (self.vectors[:, 2] / self.vectors[:, 2].sum(dtype=np.float64)).astype(np.float32)
+
+    def __len__(self):
+        return len(self.vectors)
+
+    def around(self, direction):
+        """The four directions around others, and their shares in bilinear interpolation on the grid.
+
+        Parameters
+        ----------
+        direction : mi.Vector3f
+            Unit, z ≥ 0.
+
+        Returns
+        -------
+        index : tuple of four mi.UInt32
+        share : tuple of four mi.Float
+        """
+        import drjit as dr
+
+        mi = mitsuba()
+        # To the disk with equal area, r² = 1 − cos θ, and from there to the square.
+        z = dr.clip(direction.z, 0, 1)
+        scale = dr.sqrt(1 / (1 + z))
+        square = mi.warp.uniform_disk_to_square_concentric(mi.Point2f(direction.x * scale, direction.y * scale))
+        x = dr.clip(square.x * self.columns - 0.5, 0, self.columns - 1)
+        y = dr.clip(square.y * self.rows - 0.5, 0, self.rows - 1)
+        i, j = dr.minimum(mi.UInt32(x), self.columns - 2), dr.minimum(mi.UInt32(y), self.rows - 2)
+        u, v = x - mi.Float(i), y - mi.Float(j)
+        first = j * self.columns + i
+        return (
+            (first, first + 1, first + self.columns, first + self.columns + 1),
+            ((1 - u) * (1 - v), u * (1 - v), (1 - u) * v, u * v),
+        )
+
+
+def frames(normals, reference):
+    """Rotations (n, 3, 3) whose third columns are normals (n, 3), each turned the shortest way from one frame (3, 3).
+
+    Directions of neighbouring points on a surface are then as parallel as they can be.
+    """
+    reference, normals = np.asarray(reference, np.float64), np.asarray(normals, np.float64)
+    z = reference[:, 2]
+    cosine = normals @ z
+    axis = np.cross(z, normals)
+    # Rodrigues' formula for the rotation that takes z to the normal; none is shortest between opposite ones.
+    skew = np.zeros((len(normals), 3, 3))
+    skew[:, [2, 0, 1], [1, 2, 0]] = axis
+    skew[:, [1, 2, 0], [2, 0, 1]] = -axis
+    with np.errstate(divide="ignore", invalid="ignore"):
+        turned = np.eye(3) + skew + skew @ skew / (1 + cosine)[:, None, None]
+    opposite = cosine < -1 + 1e-9
+    turned[opposite] = _half_turn(reference)
+    return turned @ reference
+
+
+def frame_of(normal):
+    """A rotation (3, 3) whose third column is a unit vector."""
+    normal = np.asarray(normal, np.float64)
+    other = np.eye(3)[np.argmin(np.abs(normal))]
+    x = np.cross(other, normal)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(normal, x), normal], axis=1)
+
+
+def _half_turn(reference):
+    x = reference[:, 0]
+    return 2 * np.outer(x, x) - np.eye(3)
+
+
+def _sides(count):
+    for rows in range(int(count**0.5), 1, -1):
+        if count % rows == 0:
+            return (rows, count // rows) if count // rows <= _SKEW * rows else None
+    return None
+
+
+def _to_hemisphere(x, y):
+    """Concentric map of the unit square to the hemisphere (k, 3), equal area."""
+    a, b = 2 * x - 1, 2 * y - 1
+    wide = np.abs(a) > np.abs(b)
+    r = np.where(wide, a, b)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        phi = np.where(wide, np.pi / 4 * (b / a), np.pi / 2 - np.pi / 4 * (a / b))
+    phi = np.where(r == 0, 0, phi)
+    z = 1 - r * r
+    sine = r * np.sqrt(2 - r * r)
+    return np.stack([np.cos(phi) * sine, np.sin(phi) * sine, z], axis=-1)

@@ -1,0 +1,144 @@
+"""From a hit on a surface to the sample points around it, in Dr.Jit."""
+
+import numpy as np
+
+from ..errors import SceneError
+from ..runtime import mitsuba
+
+REACH = 2.5  # radii up to which a sample is found
+VOXEL = 1.5  # radii along the edge of a voxel
+MOST_VOXELS = 1 << 24
+SHARPNESS = 4  # power of the interpolation's weights: they fall to a half at 1 radius
+
+
+class SampleLocator:
+    """Finds samples near places on surfaces, in the metric of `thinning`.
+
+    Each voxel of a regular grid lists all samples that can be within reach of a place in it, so that a look-up reads one list.
+
+    Parameters
+    ----------
+    positions, normals : (n, 3) float32
+    radius : float
+        Metres that samples keep from each other.
+
+    Raises
+    ------
+    SceneError
+        If there are no samples.
+    """
+
+    def __init__(self, positions, normals, radius):
+        import drjit as dr
+
+        mi = mitsuba()
+        if not len(positions):
+            raise SceneError("there are no samples to look up")
+        reach = REACH * radius
+        low, high = positions.min(axis=0) - reach, positions.max(axis=0) + reach
+        edge = max(VOXEL * radius, float((np.prod((high - low).astype(np.float64)) / MOST_VOXELS) ** (1 / 3)))
+        size = np.maximum(np.ceil((high - low) / edge).astype(np.int64), 1)
+        starts, samples = _lists(positions, low, edge, size, reach)
+        self._starts, self._samples = mi.UInt32(starts), mi.UInt32(samples)
+        # 4 floats each: gathered in one load
+        self._positions, self._normals = (mi.Float(np.pad(x, ((0, 0), (0, 1))).ravel()) for x in (positions, normals))
+        self._low, self._size = mi.Point3f(*map(float, low)), mi.Vector3i(*map(int, size))
+        dr.make_opaque(self._low, self._size)
+        self._inverse_edge = dr.opaque(mi.Float, 1 / edge)
+        self._radius, self._reach = dr.opaque(mi.Float, radius), dr.opaque(mi.Float, reach)
+
+    def nearest(self, position, normal, active=True):
+        """The nearest sample.
+
+        Parameters
+        ----------
+        position : mi.Point3f
+        normal : mi.Normal3f
+        active : mi.Bool
+
+        Returns
+        -------
+        index : mi.UInt32
+        distance : mi.Float
+            In the metric, metres; infinite where there is none within reach.
+        """
+        import drjit as dr
+
+        mi = mitsuba()
+
+        def visit(state, sample, distance):
+            nearest, least = state
+            closer = distance < least
+            return dr.select(closer, sample, nearest), dr.select(closer, distance, least)
+
+        index, squared = self._visit(position, normal, active, (mi.UInt32(0), mi.Float(dr.square(self._reach))), visit)
+        return index, dr.select(squared < dr.square(self._reach), dr.sqrt(squared), dr.inf)
+
+    def interpolated(self, values, position, normal, active=True):
+        """Values interpolated between the samples around places, by distance and normal.
+
+        Parameters
+        ----------
+        values : mi.Float
+            Three for each sample, one behind the other.
+        position, normal, active :
+            As for `nearest`.
+
+        Returns
+        -------
+        mi.Color3f
+            0 where no sample is within reach.
+        found : mi.Bool
+        """
+        import drjit as dr
+
+        mi = mitsuba()
+
+        def visit(state, sample, distance):
+            total, weights = state
+            weight = dr.maximum(1 - distance / dr.square(self._reach), 0) ** SHARPNESS
+            return total + weight * dr.gather(mi.Color3f, values, sample, weight > 0), weights + weight
+
+        total, weights = self._visit(position, normal, active, (mi.Color3f(0), mi.Float(0)), visit)
+        found = weights > 1e-12
+        return dr.select(found, total / weights, 0), found
+
+    def _visit(self, position, normal, active, state, visit):
+        """Fold `visit(state, sample, squared distance)` over the samples of each place's voxel."""
+        import drjit as dr
+
+        mi = mitsuba()
+        voxel = mi.Vector3i(dr.floor((position - self._low) * self._inverse_edge))
+        active = mi.Bool(active) & dr.all((voxel >= 0) & (voxel < self._size))
+        place = mi.UInt32((voxel.z * self._size.y + voxel.y) * self._size.x + voxel.x)
+        first = dr.gather(mi.UInt32, self._starts, place, active)
+        last = dr.gather(mi.UInt32, self._starts, place + 1, active)
+
+        def step(entry, *state):
+            sample = dr.gather(mi.UInt32, self._samples, entry)
+            p, n = dr.gather(mi.Vector4f, self._positions, sample), dr.gather(mi.Vector4f, self._normals, sample)
+            moved = mi.Vector3f(position.x - p.x, position.y - p.y, position.z - p.z)
+            turned = self._radius * mi.Vector3f(normal.x - n.x, normal.y - n.y, normal.z - n.z)
+            return entry + 1, *visit(state, sample, dr.squared_norm(moved) + dr.squared_norm(turned))
+
+        _, *state = dr.while_loop((first, *state), lambda entry, *_: entry < last, step)
+        return state
+
+
+def _lists(positions, low, edge, size, reach):
+    """For each voxel where its list starts (v + 1,), and the lists one behind the other, both uint32."""
+    first = np.floor((positions - reach - low) / edge).astype(np.int64)
+    spans = int(np.ceil(2 * reach / edge)) + 1
+    voxels, samples = [], []
+    index = np.arange(len(positions))
+    for offset in np.ndindex(spans, spans, spans):
+        voxel = first + offset
+        corner = low + voxel * edge
+        gap = np.maximum(np.maximum(corner - positions, positions - corner - edge), 0)
+        touched = (np.einsum("ij,ij->i", gap, gap) < reach**2) & (voxel >= 0).all(axis=1) & (voxel < size).all(axis=1)
+        x, y, z = voxel[touched].T
+        voxels.append((z * size[1] + y) * size[0] + x)
+        samples.append(index[touched])
+    voxels, samples = np.concatenate(voxels), np.concatenate(samples)
+    starts = np.concatenate([[0], np.cumsum(np.bincount(voxels, minlength=int(np.prod(size))))])
+    return starts.astype(np.uint32), samples[np.argsort(voxels, kind="stable")].astype(np.uint32)
