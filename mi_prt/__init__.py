@@ -13,7 +13,7 @@ from .llvm import select_llvm
 
 select_llvm()  # before anything can load Dr.Jit: an LLVM that is too old would end the process
 
-from .asset import Asset, load  # noqa: E402
+from .asset import Asset  # noqa: E402
 from .errors import (  # noqa: E402
     AssetError,
     InputError,
@@ -27,11 +27,13 @@ from .evaluate.compare import compare  # noqa: E402
 from .lighting.environment import EnvironmentMap, LightWarning  # noqa: E402
 from .lighting.light import DirectionalLight, Light  # noqa: E402
 from .lighting.local_lights import AreaLight, PointLight, SpotLight  # noqa: E402
+from .meshless_asset import MeshlessAsset  # noqa: E402
+from .opening import load  # noqa: E402
 from .precompute import precompute  # noqa: E402
 from .relight import relight_to_file  # noqa: E402
 from .render.integrator import register_integrator  # noqa: E402
 
-__version__ = "0.2.0"
+__version__ = "0.4.0"
 __all__ = [
     "AreaLight",
     "Asset",
@@ -42,6 +44,7 @@ __all__ = [
     "Light",
     "LightError",
     "LightWarning",
+    "MeshlessAsset",
     "PointLight",
     "PrtError",
     "RuntimeSetupError",

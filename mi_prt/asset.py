@@ -200,22 +200,3 @@ class Asset:
         """
         asset_file.write(self, path, folder)
         object.__setattr__(self, "path", Path(path).absolute())
-
-
-def load(path):
-    """Open an asset.
-
-    Parameters
-    ----------
-    path : path
-
-    Returns
-    -------
-    Asset
-
-    Raises
-    ------
-    AssetError
-        If the file is missing, truncated, no asset, or of a format version this program does not know.
-    """
-    return Asset(**asset_file.read(path))

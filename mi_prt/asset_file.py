@@ -3,25 +3,19 @@
 The file is read with NumPy and h5py alone; docs/asset-format.md describes it field by field.
 """
 
-import io
 import json
-import os
-from pathlib import Path
 
 import numpy as np
 import scipy.sparse
 
+from . import container
 from .basis.bases import BASES
 from .basis.haar import row_ends
 from .directions import parse_directions
-from .errors import AssetError
-from .files import replacing
 from .points.lattice import Patches, node_count
 from .points.points import POINT_FIELDS, Points
 from .transport.direct import DirectTransport
 
-FORMAT = "mi_prt asset"
-FORMAT_VERSION = 3
 UNITS = {
     "points/positions": "m",
     "points/areas": "m^2",
@@ -34,7 +28,6 @@ UNITS = {
 }
 _PATCH_FIELDS = ("levels", "offsets", "nodes", "back")
 _TEXTS = ("scene", "settings", "versions", "report")
-_OVERHEAD = 1 << 20  # bytes of a file beside its arrays: structure, and texts up to that length
 
 
 def write(asset, path, folder=None):
@@ -52,71 +45,14 @@ def write(asset, path, folder=None):
     SettingsError
         If the path cannot be written, for example because the disk is full.
     """
-    import h5py
-
-    arrays = _arrays(asset)
-    texts = {name: json.dumps(getattr(asset, name), sort_keys=True) for name in _TEXTS}
-    size = sum(a.nbytes for a in arrays.values()) + sum(map(len, texts.values())) + _OVERHEAD
-    with replacing(path, folder) as temporary, _ReservedFile(temporary, size) as stream:
-        with h5py.File(stream, "w") as file:
-            file.attrs["format"] = FORMAT
-            file.attrs["format_version"] = FORMAT_VERSION
-            for name, text in texts.items():
-                file.attrs[name] = text
-            file.attrs["units"] = json.dumps(UNITS, sort_keys=True)
-            for name, array in arrays.items():
-                file[name] = array
-            file["points"].attrs["report"] = json.dumps(asset.points.report, sort_keys=True)
-            file["points"].attrs["surfaces"] = json.dumps(asset.points.surfaces, sort_keys=True)
-            file["directions"].attrs["lattice"] = str(asset.directions)
-            file["basis"].attrs["kind"] = asset.basis.kind
-            file.attrs["complete"] = True
-
-
-class _ReservedFile(io.FileIO):
-    """An empty file whose space on the disk is taken before it is written.
-
-    HDF5 ends the process where a disk is full in the middle of a file; this raises OSError before HDF5 comes into it.
-
-    Parameters
-    ----------
-    path : path
-    size : int
-        Bytes that will not be exceeded.
-    """
-
-    def __init__(self, path, size):
-        super().__init__(path, "r+b")
-        self._end = 0
-        try:
-            if hasattr(os, "posix_fallocate"):
-                os.posix_fallocate(self.fileno(), 0, size)
-            else:
-                for first in range(0, size, _OVERHEAD):
-                    super().write(bytes(min(_OVERHEAD, size - first)))
-                super().seek(0)
-        except OSError:
-            super().close()
-            raise
-
-    def seek(self, offset, whence=os.SEEK_SET):
-        return super().seek(offset + self._end, os.SEEK_SET) if whence == os.SEEK_END else super().seek(offset, whence)
-
-    def write(self, content):
-        left = memoryview(content).cast("B")
-        while len(left):  # the system may take less than it is given
-            left = left[super().write(left) :]
-        self._end = max(self._end, self.tell())
-        return len(content)
-
-    def truncate(self, size=None):
-        self._end = self.tell() if size is None else size
-        return self._end
-
-    def close(self):
-        if not self.closed:
-            super().truncate(self._end)
-        super().close()
+    attributes = {("", name): getattr(asset, name) for name in _TEXTS} | {
+        ("", "units"): UNITS,
+        ("points", "report"): asset.points.report,
+        ("points", "surfaces"): asset.points.surfaces,
+        ("directions", "lattice"): str(asset.directions),
+        ("basis", "kind"): asset.basis.kind,
+    }
+    container.write(path, "distant", _arrays(asset), attributes, folder)
 
 
 def _arrays(asset):
@@ -143,12 +79,14 @@ def coefficient_arrays(coefficients):
     return {"coefficients": coefficients}
 
 
-def read(path):
-    """Read an asset.
+def read(file, path):
+    """Read an asset of distant light.
 
     Parameters
     ----------
-    path : path
+    file : h5py.File
+    path : Path
+        Its own.
 
     Returns
     -------
@@ -157,34 +95,9 @@ def read(path):
 
     Raises
     ------
-    AssetError
-        If the file is missing, truncated, no asset, or of a format version this program does not know.
+    KeyError, TypeError, ValueError
+        If it is damaged: see `container.opened`.
     """
-    import h5py
-
-    path = Path(path)
-    if not path.is_file():
-        raise AssetError(f"asset '{path}' does not exist")
-    try:
-        with h5py.File(path, "r") as file:
-            if file.attrs.get("format") != FORMAT:
-                raise AssetError(f"'{path}' is an HDF5 file but no mi_prt asset: make one with `mi-prt precompute`")
-            version = int(file.attrs["format_version"])
-            if version != FORMAT_VERSION:
-                raise AssetError(
-                    f"asset '{path}' has format version {version}, this program reads {FORMAT_VERSION}: precompute it again"
-                )
-            if not file.attrs.get("complete"):
-                raise AssetError(f"asset '{path}' is incomplete: precompute it again")
-            return _read(file, path)
-    except (OSError, KeyError, TypeError, ValueError) as error:
-        if isinstance(error, AssetError):
-            raise
-        reason = " ".join(str(error).split())
-        raise AssetError(f"'{path}' is truncated or no mi_prt asset ({reason})") from None
-
-
-def _read(file, path):
     points = file["points"]
     basis = BASES[file["basis"].attrs["kind"]]
     basis = basis(**{name: file[f"basis/{name}"][()] for name in basis.ARRAYS})

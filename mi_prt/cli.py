@@ -121,7 +121,7 @@ def info(
     from . import info as description
 
     if path.is_file() and _is_hdf5(path):
-        from .asset import load
+        from .opening import load
 
         found = description.describe_asset(load(path))
     else:
@@ -236,7 +236,7 @@ def relight(
     as_json: Json = False,
 ):
     """Relight an asset: an image, a mesh with vertex radiance, or plain arrays."""
-    from .asset import load
+    from .opening import load
     from .relight import relight_to_file
 
     _set_threads(threads)
@@ -265,7 +265,7 @@ def compare(
     as_json: Json = False,
 ):
     """Compare an asset with Mitsuba's ground truth and write a report with pictures."""
-    from .asset import load
+    from .opening import load
     from .evaluate.compare import compare as run
 
     _set_threads(threads)

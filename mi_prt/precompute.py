@@ -4,7 +4,7 @@ import hashlib
 import time
 from collections.abc import Callable
 from contextlib import closing, contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
 import numpy as np
@@ -20,13 +20,14 @@ from .directions import parse_directions
 from .errors import SettingsError
 from .indirect import IndirectTransport, direct_report, surface_shares
 from .memory import free_bytes, parse_bytes, resident_bytes
+from .meshless import MeshlessPrecomputation
 from .parallel import BLOCK_ROWS, map_chunks
 from .points.points import POINT_FIELDS, sample_points
 from .provenance import describe_scene
 from .room import INDIRECT_LANE_BYTES, LANE_BYTES, Room, held_coefficient_bytes
 from .runtime import count_kernels, peak_memory_bytes, versions
 from .scene.scene import open_scene
-from .settings import Settings
+from .settings import MeshlessSettings, Settings
 from .transport.direct import DirectSampler, find_buried
 from .transport.hops import blocked_share
 from .workspace import durable, temporary
@@ -35,7 +36,7 @@ STRICTER = 0.99  # margin of a second fit, for what is lost beside direct transp
 OPEN_KEYS = ("coefficients", "variance")  # what may be chosen anew when the fit could not give what was asked for
 
 
-def precompute(scene, parameters=None, progress=None, output=None, resume=False, max_memory=None, **settings):
+def precompute(scene, parameters=None, progress=None, output=None, resume=False, max_memory=None, points="vertices", **settings):
     """Precompute a scene's transport.
 
     Parameters
@@ -44,8 +45,9 @@ def precompute(scene, parameters=None, progress=None, output=None, resume=False,
     parameters : dict, optional
         Values for an XML file's `<default>` parameters.
     progress : callable(stage, done, total, detail), optional
-        Called as work advances. Stages are 'transport' and 'indirect' (in points, whose rays are traced block by block; the detail is
-        rays per second), 'basis' (in passes over the rows), 'coefficients' (in points) and 'reflections' (in coefficients).
+        Called as work advances. With points='vertices' the stages are 'transport' and 'indirect' (in points, whose rays are traced block by
+        block; the detail is rays per second), 'basis' (in passes over the rows), 'coefficients' (in points) and 'reflections' (in
+        coefficients); with points='samples' they are 'samples', 'example lights', 'importance', 'clusters' (in points) and 'reflections'.
     output : path, optional
         File to save the asset to. What is computed on the way is kept beside it, in a folder with `.partial` behind the name,
         until the file is whole: a run that was interrupted or killed can be continued.
@@ -53,33 +55,43 @@ def precompute(scene, parameters=None, progress=None, output=None, resume=False,
         Continue the unfinished run of `output`, if there is one. The file is the same as that of an undisturbed run.
     max_memory : int or str, optional
         Bytes, or such as '3G', that this process may have resident. By default what it has now and half of what is free.
+    points : 'vertices' or 'samples'
+        Vertices of the (tessellated) surfaces, for distant light; or meshless samples, for lights that move inside the scene.
     **settings
-        Fields of `Settings`: directions, basis, coefficients, variance, edge_length, rays_per_direction, bounces, indirect,
-        paths_per_point, denoise, seed.
+        Fields of `Settings` (directions, basis, coefficients, variance, edge_length, rays_per_direction, bounces, indirect,
+        paths_per_point, denoise, seed), or of `MeshlessSettings` (count, cluster_size, depth_directions, depth_coefficients,
+        example_lights, transfer_coefficients, transfer_error, quantize, bounces, seed).
 
     Returns
     -------
-    Asset
-        Its `report` holds counts, the captured variance and the relative error of the transport.
+    Asset or MeshlessAsset
+        Its `report` holds counts, and what compression loses.
 
     Raises
     ------
     SceneError, SettingsError
-        See `open_scene`, `sample_points`, `Settings`, `workspace.durable`.
+        See `open_scene`, `sample_points`, `scatter_samples`, `Settings`, `MeshlessSettings`, `workspace.durable`.
     """
-    return measure(scene, parameters, progress, output, resume, max_memory, **settings)[0]
+    return measure(scene, parameters, progress, output, resume, max_memory, points, **settings)[0]
 
 
-def measure(scene, parameters=None, progress=None, output=None, resume=False, max_memory=None, **settings):
+def measure(scene, parameters=None, progress=None, output=None, resume=False, max_memory=None, points="vertices", **settings):
     """`precompute`, and what it cost.
 
     Returns
     -------
-    asset : Asset
+    asset : Asset or MeshlessAsset
     cost : dict
-        rays, kernels (compiled), peak_memory_bytes, seconds{scene, points, transport, basis, write} of this run alone.
+        rays, kernels (compiled), peak_memory_bytes, seconds of the stages of this run alone.
     """
-    settings = Settings(**settings)
+    if points not in POINTS:
+        raise SettingsError(f"points '{points}' are not known: use {' or '.join(POINTS)}")
+    kind, run = POINTS[points]
+    known = [field.name for field in fields(kind)]
+    foreign = [name for name in settings if name not in known]
+    if foreign:
+        raise SettingsError(f"{foreign[0]} is no setting of points '{points}', which has {', '.join(known)}")
+    settings = kind(**settings)
     if output is not None:
         output = Path(output).resolve()
     elif resume:
@@ -89,54 +101,80 @@ def measure(scene, parameters=None, progress=None, output=None, resume=False, ma
     clock = _Clock()
     with count_kernels() as kernels:
         scene = open_scene(scene, parameters)
-        description = describe_scene(scene)
+        description = describe_scene(scene, local_lights=points == "samples")
         if output is not None and scene.source.path and output == Path(scene.source.path).resolve():
             raise SettingsError(f"output '{output}' is the scene itself: give another name")
         clock.lap("scene")
-        points = sample_points(scene, settings.edge_length)
-        directions = parse_directions(settings.directions)
-        target = settings.target(len(points))
-        room = Room(limit, scene, points, directions, settings, target)
-        clock.lap("points")
-        run = _identity(settings, scene, points)
-        with temporary() if output is None else durable(output, run, resume, OPEN_KEYS) as workspace:
-            sampler = DirectSampler(scene, points, directions, settings.rays_per_direction, room.lanes)
-            with closing(workspace.rows("visibility", len(points), sampler.row_bytes)) as bits:
-                _trace("transport", sampler, bits, progress)
-                transport = sampler.transport(bits)
-                dark = transport.dark()
-                buried = find_buried(scene, points, dark, room.lanes)
-                clock.lap("transport")
-                job = _Compression(scene, points, directions, settings, target, room, workspace, run, progress)
-                fit, coefficients, reflections = job.run(transport, buried, clock)
-            asset = Asset(
-                points,
-                buried,
-                directions,
-                fit.basis,
-                coefficients,
-                scene=description,
-                settings=asdict(settings) | {"coefficients": len(fit.basis), "edge_length": points.report["edge_length"]},
-                versions=versions(),
-                report={
-                    "rays": transport.rays,
-                    "dark_points": int(dark.sum()),
-                    "buried_points": int(buried.sum()),
-                    "captured_variance": fit.captured_variance,
-                    "relative_error": fit.relative_error,
-                    **reflections,
-                },
-            )
-            if output is not None:
-                asset.save(output, workspace.folder)
-                clock.lap("write")
+        asset = run(scene, description, settings, progress, output, resume, limit, clock)
     cost = {
-        "rays": transport.rays,
+        "rays": asset.report["rays"],
         "kernels": kernels.compiled,
         "peak_memory_bytes": peak_memory_bytes(),
         "seconds": clock.seconds,
     }
     return asset, cost
+
+
+@contextmanager
+def _workspace(output, identity, resume, open_keys=()):
+    """Where intermediate results are; the caller saves the asset within the block."""
+    with temporary() if output is None else durable(output, identity, resume, open_keys) as workspace:
+        yield workspace
+
+
+def _for_local_lights(scene, description, settings, progress, output, resume, limit, clock):
+    job = MeshlessPrecomputation(scene, settings, progress, limit)
+    clock.lap("samples")
+    with _workspace(output, job.identity(), resume) as workspace:
+        asset = job.run(workspace, description, clock)
+        if output is not None:
+            asset.save(output, workspace.folder)
+            clock.lap("write")
+    return asset
+
+
+def _for_distant_light(scene, description, settings, progress, output, resume, limit, clock):
+    points = sample_points(scene, settings.edge_length)
+    directions = parse_directions(settings.directions)
+    target = settings.target(len(points))
+    room = Room(limit, scene, points, directions, settings, target)
+    clock.lap("points")
+    run = _identity(settings, scene, points)
+    with _workspace(output, run, resume, OPEN_KEYS) as workspace:
+        sampler = DirectSampler(scene, points, directions, settings.rays_per_direction, room.lanes)
+        with closing(workspace.rows("visibility", len(points), sampler.row_bytes)) as bits:
+            _trace("transport", sampler, bits, progress)
+            transport = sampler.transport(bits)
+            dark = transport.dark()
+            buried = find_buried(scene, points, dark, room.lanes)
+            clock.lap("transport")
+            job = _Compression(scene, points, directions, settings, target, room, workspace, run, progress)
+            fit, coefficients, reflections = job.run(transport, buried, clock)
+        asset = Asset(
+            points,
+            buried,
+            directions,
+            fit.basis,
+            coefficients,
+            scene=description,
+            settings=asdict(settings) | {"coefficients": len(fit.basis), "edge_length": points.report["edge_length"]},
+            versions=versions(),
+            report={
+                "rays": transport.rays,
+                "dark_points": int(dark.sum()),
+                "buried_points": int(buried.sum()),
+                "captured_variance": fit.captured_variance,
+                "relative_error": fit.relative_error,
+                **reflections,
+            },
+        )
+        if output is not None:
+            asset.save(output, workspace.folder)
+            clock.lap("write")
+    return asset
+
+
+POINTS = {"vertices": (Settings, _for_distant_light), "samples": (MeshlessSettings, _for_local_lights)}
 
 
 def _identity(settings, scene, points):

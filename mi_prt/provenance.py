@@ -9,8 +9,8 @@ from .points.tessellate import TESSELLATED_SHAPES
 from .scene.scene import open_scene
 
 
-def describe_scene(scene):
-    """What an asset records of its scene: kind, path, parameters, hash, appearance, left_out."""
+def describe_scene(scene, local_lights=False):
+    """What an asset records of its scene: kind, path, parameters, hash, appearance, left_out (which see)."""
     source = scene.source
     return {
         "kind": source.kind,
@@ -18,12 +18,18 @@ def describe_scene(scene):
         "parameters": source.parameters,
         "hash": scene.hash,
         "appearance": scene.appearance,
-        "left_out": left_out(scene),
+        "left_out": left_out(scene, local_lights),
     }
 
 
-def left_out(scene):
+def left_out(scene, local_lights=False):
     """What of a scene the transport does not model, in words, one entry for each kind.
+
+    Parameters
+    ----------
+    scene : Scene
+    local_lights : bool
+        Whether the transport is that of local lights, at samples on any shape, or that of distant light, at vertices.
 
     Returns
     -------
@@ -40,16 +46,17 @@ def left_out(scene):
         for (material, what), names in by_material.items()
     ]
     for surface in scene.surfaces:
-        if surface.kind not in TESSELLATED_SHAPES:
+        if surface.kind not in TESSELLATED_SHAPES and not local_lights:
             what = f"{surface.kind}: blocks light but reflects none"
             entries.append({"what": what, "shapes": [surface.name], "share": None})
         if surface.shape.interior_medium() or surface.shape.exterior_medium():
             entries.append({"what": "participating medium", "shapes": [surface.name], "share": None})
     lamps = {}
-    for emitter in scene.local_emitters:
+    for emitter in scene.distant_emitters if local_lights else scene.local_emitters:
         lamps[emitter.class_name()] = lamps.get(emitter.class_name(), 0) + 1
+    where = "distant" if local_lights else "local"
     for kind, count in lamps.items():
-        entries.append({"what": f"{kind}: light of {count} local emitters", "shapes": [], "share": None})
+        entries.append({"what": f"{kind}: light of {count} {where} emitters", "shapes": [], "share": None})
     return entries
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from .basis.bases import check_basis, check_components, default_components, most_components
 from .basis.target import Target
 from .directions import parse_directions
+from .directions.hemisphere import Hemisphere
 from .errors import SettingsError
 
 DEFAULT_VARIANCE = 0.95
@@ -154,3 +155,79 @@ def _number(name, value):
     except (TypeError, ValueError):
         auto = "neither 'auto' nor" if name == "edge_length" else "not"
         raise SettingsError(f"{name} {value!r} is {auto} a number") from None
+
+
+QUANTIZATIONS = ("16", "none")
+
+
+@dataclass(frozen=True)
+class MeshlessSettings:
+    """What a precomputation for local lights is asked to do (Meshless PRT); stored with the asset.
+
+    Parameters
+    ----------
+    count : int
+        Sample points, 1…1,000,000.
+    cluster_size : int
+        Samples in a cluster, on average.
+    depth_directions : int
+        Of each sample's depth buffer: a product of two numbers that differ by half at most.
+    depth_coefficients : int
+        Components of the depth buffers of each cluster.
+    example_lights : int
+        Point lights that the basis of direct light is made from.
+    transfer_coefficients : int
+        Components of direct light on each cluster.
+    transfer_error : float
+        Relative RMS error of indirect irradiance that may be made by dropping small parts of the transfer matrices; 0 drops none.
+    quantize : '16' or 'none'
+        Bits of an integer in the place of float32.
+    bounces : int or 'auto'
+        Most reflections of light on its way to a point; 0 is direct light alone, 'auto' any number.
+    seed : int
+
+    Raises
+    ------
+    SettingsError
+        If a value is out of range.
+    """
+
+    count: int = 45_000
+    cluster_size: int = 1000
+    depth_directions: int = 2016
+    depth_coefficients: int = 50
+    example_lights: int = 1000
+    transfer_coefficients: int = 20
+    transfer_error: float = 0.01
+    quantize: str = "16"
+    bounces: int | str = "auto"
+    seed: int = 0
+
+    def __post_init__(self):
+        most = {
+            "count": (1, 1_000_000),
+            "cluster_size": (1, 1_000_000),
+            "depth_directions": (16, 1 << 16),
+            "depth_coefficients": (1, 1 << 12),
+            "example_lights": (1, 100_000),
+            "transfer_coefficients": (1, 1 << 10),
+            "bounces": (0, MAX_BOUNCES),
+            "seed": (0, (1 << 31) - 1),
+        }
+        for name, (low, high) in most.items():
+            value = getattr(self, name)
+            words = name.replace("_", " ")
+            if name == "bounces" and value in (None, "auto"):
+                object.__setattr__(self, name, "auto")
+                continue
+            if isinstance(value, bool) or not isinstance(value, int | np.integer) or not low <= value <= high:
+                raise SettingsError(f"{words} must be an integer {low}…{high:,}{' or auto' if name == 'bounces' else ''}, got {value!r}")
+            object.__setattr__(self, name, int(value))
+        Hemisphere(self.depth_directions)
+        error = _number("transfer_error", self.transfer_error)
+        if not 0 <= error < 1:
+            raise SettingsError(f"transfer error must be at least 0 and below 1, got {self.transfer_error}")
+        object.__setattr__(self, "transfer_error", error)
+        object.__setattr__(self, "quantize", str(self.quantize))
+        if self.quantize not in QUANTIZATIONS:
+            raise SettingsError(f"quantize '{self.quantize}' is not known: use {' or '.join(QUANTIZATIONS)}")

@@ -4,7 +4,7 @@ from functools import cache
 
 import numpy as np
 
-from ..asset import load
+from ..opening import load
 from ..errors import InputError, SettingsError
 from ..lighting.scene_light import scene_light
 from ..points.locate import PatchLocator
