@@ -12,6 +12,7 @@ from .lighting.environment import LightWarning
 from .lighting.light import as_light
 from .lighting.local import arrival, hull_warning, refuse_all_but_point_lights
 from .parallel import BLOCK_ROWS, map_chunks, one_blas_thread
+from .points.interpolate import PatchInterpolator
 from .points.points import Points
 
 
@@ -181,6 +182,10 @@ class Asset:
     def transport(self, rows):
         """Transport (len(rows), s) float32 as the basis reconstructs it, or (len(rows), 3, s); `rows` indexes points."""
         return self.basis.reconstruct(self.coefficients[rows])
+
+    def interpolator(self, scene):
+        """What gives irradiance between the points at hits on a Scene, a PatchInterpolator."""
+        return PatchInterpolator(scene, self.points, self.buried)
 
     # --- file ----------------------------------------------------------------------------------------------------
 

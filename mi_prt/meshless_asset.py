@@ -11,6 +11,7 @@ from .errors import LightError, SettingsError
 from .lighting.emission import Emission, emission_of
 from .lighting.light import as_light
 from .parallel import one_blas_thread
+from .points.interpolate import SampleInterpolator
 from .points.samples import Samples
 from .transport.depth import DepthBuffers
 from .transport.hemispheres import cluster_frames
@@ -127,6 +128,10 @@ class MeshlessAsset:
     @cached_property
     def _reflection(self):
         return self.points.albedo * np.float32(1 / np.pi)
+
+    def interpolator(self, scene):
+        """What gives irradiance between the points at hits on a Scene, a SampleInterpolator."""
+        return SampleInterpolator(scene, self.samples)
 
     # --- file ----------------------------------------------------------------------------------------------------
 

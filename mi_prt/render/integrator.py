@@ -6,12 +6,18 @@ import numpy as np
 
 from ..opening import load
 from ..errors import InputError, SettingsError
+from ..lighting.emission import emission_of
+from ..lighting.local_emitters import local_scene_light
+from ..lighting.places import Places
 from ..lighting.scene_light import scene_light
-from ..points.locate import PatchLocator
+from ..meshless_asset import MeshlessAsset
 from ..runtime import VARIANTS, mitsuba
 from ..scene.materials import reflectance_at
 from ..scene.scene import Scene, SceneSource
 from ..scene.traversal import digest_of
+from .direct_light import direct_irradiance
+
+DIRECT = ("points", "pixels")
 
 
 def register_integrator():
@@ -42,15 +48,17 @@ def _plugin_class(variant):
     class PRTIntegrator(mi.SamplingIntegrator):
         """Precomputed radiance transfer (`prt`).
 
-        Shows a scene under its distant emitters with the transport of an asset. The irradiance at the asset's points is
-        interpolated at each hit and multiplied by the albedo there, so textures keep their own resolution; emitters
-        and the background are shown as Mitsuba's own integrators show them.
+        Shows a scene under its emitters with the transport of an asset: its distant emitters, or its local ones if the asset is one of
+        local lights. The irradiance at the asset's points is interpolated at each hit and multiplied by the albedo there, so textures
+        keep their own resolution; emitters and the background are shown as Mitsuba's own integrators show them.
 
         Parameters (plugin)
         -------------------
         filename : str
             The asset; relative paths are resolved as Mitsuba resolves them (next to the XML file).
         hide_emitters : bool, default false
+        direct : string, default "points"
+            With an asset of local lights, where direct light is computed: at its "points", or with shadow rays at the "pixels".
 
         Raises
         ------
@@ -59,15 +67,20 @@ def _plugin_class(variant):
         SceneError
             When rendering a scene whose geometry is not that of the asset.
         LightError
-            When rendering a scene without distant emitters.
+            When rendering a scene without such emitters.
+        SettingsError
+            If `direct` is another.
         """
 
-        def __init__(self, properties, asset=None, irradiance=None):
+        def __init__(self, properties, asset=None, irradiance=None, pixel_light=None):
             super().__init__(properties)
             self.asset = asset or _load(str(properties["filename"]))
-            self._keep = mi.Float(np.where(self.asset.buried, 0.0, 1.0).astype(np.float32))
+            self._direct = str(properties.get("direct", "points"))
+            if self._direct not in DIRECT:
+                raise SettingsError(f"direct '{self._direct}' is not known: use {' or '.join(DIRECT)}")
             self._follows_emitters = irradiance is None
             self._irradiance = None if irradiance is None else mi.Float(irradiance.ravel())
+            self._places = None if pixel_light is None else Places(pixel_light)
             self._scene = self._light = None
 
         def render(self, scene, sensor=0, *arguments, **named):
@@ -79,13 +92,25 @@ def _plugin_class(variant):
             opened = Scene(scene, SceneSource("object", content=scene))
             if self._scene is not scene or self._wrapped.hash != opened.hash:
                 self._scene = None  # until the new one is known to fit
-                self._locator = PatchLocator(opened, self.asset.points)
+                self._interpolator = self.asset.interpolator(opened)
                 self._wrapped, self._scene, self._light = opened, scene, None
-            light = digest_of(self._wrapped.distant_emitters) if self._follows_emitters else None
+            if not self._follows_emitters:
+                return
+            local = isinstance(self.asset, MeshlessAsset)
+            light = digest_of(self._wrapped.local_emitters if local else self._wrapped.distant_emitters)
             if self._light != light:
-                irradiance = self.asset.irradiance(scene_light(self._wrapped))
-                self._irradiance = mi.Float(irradiance.ravel())
+                self._irradiance = mi.Float(self._under(self._wrapped, local).ravel())
                 self._light = light
+
+        def _under(self, scene, local):
+            """Irradiance at the asset's points under a scene's own emitters."""
+            if not local:
+                return self.asset.irradiance(scene_light(scene))
+            light = local_scene_light(scene)
+            if self._direct == "points":
+                return self.asset.irradiance(light)
+            self._places = Places(emission_of(light))
+            return self.asset.irradiance(light, "indirect")
 
         def sample(self, scene, sampler, ray, medium=None, active=True):
             if self._scene is not scene:
@@ -94,13 +119,10 @@ def _plugin_class(variant):
             hit = active & si.is_valid()
 
             # --- light that the surface reflects
-            points, weights, found = self._locator.locate(pi, si, hit)
-            # Buried corners of the triangle around a visible hit would darken it: the others take their share.
-            kept = [w * dr.gather(mi.Float, self._keep, p, found) for p, w in zip(points, weights)]
-            sum_kept = sum(kept)
-            usable = sum_kept > 1e-4
-            shares = [dr.select(usable, k / sum_kept, w) for k, w in zip(kept, weights)]
-            irradiance = sum(w * dr.gather(mi.Color3f, self._irradiance, p, found) for p, w in zip(points, shares))
+            irradiance, found = self._interpolator.irradiance(self._irradiance, pi, si, ray, hit)
+            if self._places is not None:
+                irradiance += direct_irradiance(self._wrapped, self._places, si, ray, hit)
+                found = hit
             albedo = reflectance_at(si, self._wrapped.surfaces, found)
             radiance = dr.select(found, albedo * irradiance / dr.pi, 0)
 
@@ -140,14 +162,16 @@ def _plugin_class(variant):
     return PRTIntegrator
 
 
-def integrator_for(asset, irradiance=None):
+def integrator_for(asset, irradiance=None, pixel_light=None):
     """The integrator for an asset in memory.
 
     Parameters
     ----------
     asset : Asset
     irradiance : (n, 3), optional
-        W/m² at the asset's points; by default that under the distant emitters of the scene it renders.
+        W/m² at the asset's points; by default that under the emitters of the scene it renders.
+    pixel_light : Emission, optional
+        Whose direct light is computed at each hit, beside that irradiance.
 
     Returns
     -------
@@ -163,7 +187,7 @@ def integrator_for(asset, irradiance=None):
         irradiance = np.asarray(irradiance, dtype=np.float32)
         if irradiance.shape != (len(asset.points), 3):
             raise SettingsError(f"irradiance must be of shape ({len(asset.points)}, 3), got {irradiance.shape}")
-    return _plugin_class(mi.variant())(mi.Properties("prt"), asset, irradiance)
+    return _plugin_class(mi.variant())(mi.Properties("prt"), asset, irradiance, pixel_light)
 
 
 def _load(filename):

@@ -8,6 +8,7 @@ move, change and multiply without a new kernel.
 import numpy as np
 from scipy.spatial import cKDTree
 
+from ..lighting.places import Places
 from ..runtime import mitsuba
 from .examples import raised_height
 
@@ -15,7 +16,7 @@ TOLERANCE = 0.03  # share of its distance by which a light may lie behind what t
 CLEARANCE = 0.25  # share of its distance by which a light is taken to lie off the nearest surface, on its own side of it
 SOFTNESS = 0.15  # share of the distance over which the comparison goes from dark to lit
 FAR = 0.8  # share of the extent from which on all light is equally far
-_PLACE = 16  # floats of an emitting place
+ON_SURFACE = 1e-3  # radii of samples from a surface, below which a place is on it
 
 
 class LocalDirect:
@@ -44,8 +45,8 @@ class LocalDirect:
         self._coefficients = mi.Float(np.pad(depth.coefficients, ((0, 0), (0, extra))).ravel())
         labels = np.repeat(np.arange(len(samples.roots)), np.diff(samples.starts))
         self._labels = mi.UInt32(labels.astype(np.uint32))
-        fields = (points.positions, points.areas[:, None], *np.moveaxis(rotations.astype(np.float32), 2, 0))
-        self._points = mi.Float(np.hstack([fields[0], fields[1], *(np.pad(x, ((0, 0), (0, 1))) for x in fields[2:])]).ravel())
+        axes = (np.pad(axis, ((0, 0), (0, 1))) for axis in np.moveaxis(rotations.astype(np.float32), 2, 0))
+        self._points = mi.Float(np.hstack([points.positions, points.areas[:, None], *axes]).ravel())
         self._far = dr.opaque(mi.Float, FAR * depth.extent)
 
     def irradiance(self, emission):
@@ -65,64 +66,46 @@ class LocalDirect:
         if not len(emission):
             return (np.zeros((self._count, 3), np.float32) for _ in range(2))
         mi = mitsuba()
-        places = mi.Float(self._places(emission).ravel())
-        total = dr.opaque(mi.UInt32, len(emission))
+        places = Places(emission, self._sides(emission))
         point = dr.arange(mi.UInt32, self._count)
         own, *axes = (dr.gather(mi.Vector4f, self._points, 4 * point + i) for i in range(4))
         position, area = mi.Point3f(own.x, own.y, own.z), own.w
         axes = [mi.Vector3f(axis.x, axis.y, axis.z) for axis in axes]
 
         def add(number, at_point, averaged):
-            a, b, c, d = (dr.gather(mi.Vector4f, places, 4 * number + i) for i in range(4))
-            place, axis, intensity = mi.Point3f(a.x, a.y, a.z), mi.Vector3f(a.w, b.x, b.y), mi.Color3f(b.z, b.w, c.x)
-            toward = place - position
-            distance = dr.norm(toward)
+            toward, intensity, side = places.sent(number, position)
+            distance, height = dr.norm(toward), dr.dot(toward, axes[2])
             direction = toward * dr.select(distance > 0, 1 / distance, 0)
-            height = dr.dot(toward, axes[2])
-            cosine = -dr.dot(direction, axis)
-            angle = dr.acos(dr.clip(cosine, -1, 1))
-            cone = dr.select(angle <= c.w, 1, dr.clip((c.z - angle) / dr.maximum(c.z - c.w, 1e-30), 0, 1))
-            strength = cone * dr.select(c.y > 0, dr.maximum(cosine, 0), 1)
-            lit = (height > 0) & (strength > 0)
+            lit = (height > 0) & (dr.max(intensity) > 0)
             # A light near a surface is taken farther off it, on the side where it stands: depth is not as exact as to tell them apart.
-            pushed = toward + mi.Vector3f(d.x, d.y, d.z) * dr.maximum(CLEARANCE * distance - d.w, 0)
+            pushed = toward + mi.Vector3f(side.x, side.y, side.z) * dr.maximum(CLEARANCE * distance - side.w, 0)
             compared = dr.minimum(dr.norm(pushed) * (1 - TOLERANCE), self._far)
             local = mi.Vector3f(*(dr.dot(direction, x) for x in axes))
             visible = dr.if_stmt((point, local, compared), lit, self._visibility, lambda *_: mi.Float(0))
-            squared = dr.squared_norm(toward)
+            squared = dr.square(distance)
             raised = raised_height(height, area)
             spread = raised * (squared - dr.square(height) + dr.square(raised)) ** -1.5
-            here = dr.select(squared > 0, height / (squared * distance), 0)
+            here = height / (squared * distance)
             here = dr.select(dr.isfinite(here), here, 0)
-            factor = dr.select(lit, visible * strength, 0)
+            factor = dr.select(lit, visible, 0)
             return number + 1, at_point + intensity * (factor * here), averaged + intensity * (factor * spread)
 
         state = (dr.opaque(mi.UInt32, 0), mi.Color3f(0), mi.Color3f(0))
-        _, *sums = dr.while_loop(state, lambda number, *_: number < total, add)
+        _, *sums = dr.while_loop(state, lambda number, *_: number < places.count, add)
         dr.eval(sums)
         largest = np.finfo(np.float32).max
         return (np.minimum(np.array(x).T, largest) for x in sums)
 
-    def _places(self, emission):
-        """Emitting places (k, 16) float32: what the kernel reads of each."""
+    def _sides(self, emission):
+        """For each place (k, 4): the normal of the nearest surface, on the side where the place is, and how far from it that is."""
         distance, nearest = self._tree.query(emission.positions)
         normals = self._normals[nearest]
         height = np.einsum("ij,ij->i", emission.positions - self._tree.data[nearest], normals)
         # A place on a surface that shines to one side stands on that side.
-        on_surface = (np.abs(height) < 1e-3 * self._radius) & (emission.cosine > 0)
+        on_surface = (np.abs(height) < ON_SURFACE * self._radius) & (emission.cosine > 0)
         side = np.where(on_surface, np.einsum("ij,ij->i", emission.axes, normals), height)
         clearance = np.maximum(np.abs(height), distance - self._radius)
-        columns = (
-            emission.positions,
-            emission.axes,
-            emission.intensity,
-            emission.cosine[:, None],
-            emission.cutoff[:, None],
-            emission.beam[:, None],
-            np.where(side < 0, -1, 1)[:, None] * normals,
-            clearance[:, None],
-        )
-        return np.hstack(columns).astype(np.float32)
+        return np.hstack([np.where(side < 0, -1, 1)[:, None] * normals, clearance[:, None]])
 
     def _visibility(self, point, local, compared):
         """Share of a light that is visible from points, in local directions and at a distance."""
