@@ -85,7 +85,7 @@ class MeshlessAsset:
         """
         if component not in COMPONENTS:
             raise SettingsError(f"component '{component}' is not known: use {', '.join(COMPONENTS)}")
-        direct, averaged = self._direct.irradiance(self._emission(light))
+        direct, averaged = self._direct.irradiance(self.emission(light))
         if component == "direct":
             return direct
         indirect = self._indirect(averaged)
@@ -99,7 +99,8 @@ class MeshlessAsset:
         """Outgoing radiance B = ρ/π · E (n, 3) of irradiance (n, 3) at the points."""
         return irradiance * self._reflection
 
-    def _emission(self, light):
+    def emission(self, light=None):
+        """Emission of lights as `irradiance` takes them; see there for errors."""
         if light is None:
             if not len(self.own_light):
                 raise LightError(self.report["no_own_light"])

@@ -10,14 +10,14 @@ from .files import check_writable
 from .lighting.environment import LightWarning
 from .lighting.local import hull_warning
 from .lighting.scene_light import is_of_scene, lit_scene, turned_light
+from .meshless_asset import MeshlessAsset
 from .provenance import open_scene_of
+from .relight_local import IMAGES, MESHES, relight_local
 from .render.display import exposure
 from .render.export import write_image, write_npz, write_ply
 from .render.image import pick_sensor, render_image, resized
 from .scene.scene import Scene
 
-IMAGES = (".exr", ".png")
-MESHES = (".ply", ".npz")
 RENDERERS = ("mitsuba", "raster")
 
 
@@ -32,6 +32,8 @@ def relight_to_file(
     renderer="mitsuba",
     spp=64,
     nearest=1,
+    component="total",
+    direct="points",
 ):
     """Relight an asset and write the result.
 
@@ -41,7 +43,7 @@ def relight_to_file(
     output : path
         .exr (linear) or .png (exposed, sRGB) image; .ply or .npz of the points.
     light : what `as_light` accepts, or a list of such and 'scene', optional
-        By default 'scene', the scene's own distant light.
+        By default 'scene': the scene's own distant light, or its local light if the asset is one of local lights.
     rotate : (axis, degrees), optional
         Turns the distant light.
     scene : path, dict or mi.Scene, optional
@@ -49,11 +51,15 @@ def relight_to_file(
     sensor : int
     size : (width, height), optional
     renderer : 'mitsuba' or 'raster'
-        The integrator `prt`, or pyrender.
+        The integrator `prt`, or pyrender: triangles between vertices, splats of samples.
     spp : int
         Samples per pixel of the integrator.
     nearest : int
-        Directions that stand for a local light, see `Asset.irradiance`.
+        Directions that stand for a local light in an asset of distant light, see `Asset.irradiance`.
+    component : 'total', 'direct' or 'indirect'
+        Of an asset of local lights, what is shown.
+    direct : 'points' or 'pixels'
+        Of an asset of local lights, where direct light is computed: at the points, or with shadow rays at each pixel.
 
     Returns
     -------
@@ -71,6 +77,15 @@ def relight_to_file(
     LightWarning
         If a local light is inside the convex hull of the scene; with the measured error.
     """
+    if isinstance(asset, MeshlessAsset):
+        if rotate is not None or nearest != 1:
+            raise SettingsError("rotate and nearest are for distant light, and this asset is one of local lights (points='samples')")
+        return relight_local(asset, output, light, scene, sensor, size, renderer, spp, component, direct)
+    if (component, direct) != ("total", "points"):
+        raise SettingsError(
+            f"component '{component}', direct '{direct}': an asset of distant light holds all light in one; precompute the scene with "
+            "points='samples' to tell them apart"
+        )
     output = Path(output)
     suffix = output.suffix.lower()
     if suffix not in IMAGES + MESHES:

@@ -12,6 +12,7 @@ from ..runtime import mitsuba
 
 LEAST, MOST = 16, 1 << 16
 _SKEW = 1.5  # between the sides of the grid, at most
+_OPPOSITE = 1e-6  # length of the sum of two unit vectors, below which they count as opposite
 
 
 class Hemisphere:
@@ -89,18 +90,14 @@ def frames(normals, reference):
     Directions of neighbouring points on a surface are then as parallel as they can be.
     """
     reference, normals = np.asarray(reference, np.float64), np.asarray(normals, np.float64)
+    normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
     z = reference[:, 2]
-    cosine = normals @ z
-    axis = np.cross(z, normals)
-    # Rodrigues' formula for the rotation that takes z to the normal; none is shortest between opposite ones.
-    skew = np.zeros((len(normals), 3, 3))
-    skew[:, [2, 0, 1], [1, 2, 0]] = axis
-    skew[:, [1, 2, 0], [2, 0, 1]] = -axis
-    with np.errstate(divide="ignore", invalid="ignore"):
-        turned = np.eye(3) + skew + skew @ skew / (1 + cosine)[:, None, None]
-    opposite = cosine < -1 + 1e-9
-    turned[opposite] = _half_turn(reference)
-    return turned @ reference
+    # A half turn about z and one about the middle between z and the normal together take z to the normal the shortest way.
+    middle = normals + z
+    length = np.linalg.norm(middle, axis=1, keepdims=True)
+    opposite = length[:, 0] < _OPPOSITE
+    middle = np.where(opposite[:, None], reference[:, 0], middle / np.maximum(length, _OPPOSITE))
+    return _half_turns(middle) @ _half_turns(z[None]) @ reference
 
 
 def frame_of(normal):
@@ -112,9 +109,9 @@ def frame_of(normal):
     return np.stack([x, np.cross(normal, x), normal], axis=1)
 
 
-def _half_turn(reference):
-    x = reference[:, 0]
-    return 2 * np.outer(x, x) - np.eye(3)
+def _half_turns(axes):
+    """Rotations (n, 3, 3) by 180 degrees about unit axes (n, 3)."""
+    return 2 * axes[:, :, None] * axes[:, None, :] - np.eye(3)
 
 
 def _sides(count):

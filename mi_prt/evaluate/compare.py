@@ -1,12 +1,16 @@
 """An asset against Mitsuba's ground truth, at the points and in the image, with the error explained."""
 
 import time
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from ..errors import SettingsError
-from ..lighting.scene_light import lit_scene, turned_light
+from ..lighting.emission import emission_of
+from ..lighting.scene_light import chosen_local_light, lit_scene, turned_light
+from ..meshless_asset import MeshlessAsset
 from ..provenance import open_scene_of
 from ..render.display import display, exposure
 from ..render.image import coverage, pick_sensor, render_image, resized
@@ -34,6 +38,7 @@ def compare(
     seed=0,
     progress=lambda stage, done, total: None,
     nearest=1,
+    direct="points",
 ):
     """Compare an asset with Mitsuba and write the comparison to a folder.
 
@@ -43,7 +48,7 @@ def compare(
     folder : path
         Gets report.json, index.html, EXRs and PNGs; created if need be.
     light : what `as_light` accepts, or a list of such and 'scene', optional
-        By default 'scene', the scene's own distant light.
+        By default 'scene': the scene's own distant light, or its local light if the asset is one of local lights.
     rotate : (axis, degrees), optional
         Turns the distant light.
     scene : path, dict or mi.Scene, optional
@@ -54,18 +59,21 @@ def compare(
     spp : int
         Samples per pixel of the reference image.
     reference : 'modelled' or 'full'
-        Truth as modelled (other materials replaced by their diffuse albedo, local emitters dark) or as written.
+        Truth as modelled (other materials replaced by their diffuse albedo, emitters that are not asked for dark) or as written.
     seed : int
     progress : callable(stage, done, total)
     nearest : int
         Directions that stand for a local light, see `Asset.irradiance`.
+    direct : 'points' or 'pixels'
+        Of an asset of local lights, where direct light of the image is computed.
 
     Returns
     -------
     dict
         points{count, relative_rmse, bias, reference_noise, …}, image{relative_rmse, bias, psnr, flip,
-        reference_noise, …}, seconds{relight, reference}, and what was compared. With local lights also
-        local_light_error{relative_rmse, bias, points}: that of their irradiance alone.
+        reference_noise, …}, seconds{relight, reference}, and what was compared. Of an asset of distant light, with local lights, also
+        local_light_error{relative_rmse, bias, points}: that of their irradiance alone. Of one of local lights also
+        components{direct, indirect} with errors as those of the points.
 
     Warns
     -----
@@ -78,27 +86,35 @@ def compare(
         raise SettingsError(f"spp {spp} is too low: the reference's noise is told from two halves, so at least 2")
     folder = _made_folder(folder)
     opened = open_scene_of(asset, scene)
-    shown, chosen_light = turned_light(opened, light, rotate)
-    truth = lit_scene(opened.modelled() if reference == "modelled" else opened.mi_scene, shown)
+    if isinstance(asset, MeshlessAsset):
+        if rotate is not None or nearest != 1:
+            raise SettingsError("rotate and nearest are for distant light, and this asset is one of local lights (points='samples')")
+        case = _under_local_lights(asset, opened, light, reference, direct, seed)
+    else:
+        if direct != "points":
+            raise SettingsError(f"direct '{direct}' is for an asset of local lights (points='samples'), and this is one of distant light")
+        case = _under_distant_light(asset, opened, light, rotate, reference, nearest, seed)
     seconds = {}
 
     progress("relight", 0, 3)
     started = time.perf_counter()
-    irradiance = asset.irradiance_from(*asset.project_light(chosen_light), chosen_light.point_lights, nearest)
+    irradiance = case.irradiance()
     seconds["relight"] = time.perf_counter() - started
 
     progress("reference at the points", 1, 3)
     started = time.perf_counter()
     chosen = ground_truth.compared_points(asset, COMPARED_POINTS, seed)
     bounces = asset.reference_bounces
-    at_points = ground_truth.irradiance(truth, asset.points.at(chosen), POINT_SAMPLES, POINT_PATHS, bounces, seed)
+    points = asset.points.at(chosen)
+    truth_direct = ground_truth.point_irradiance(case.truth, points, POINT_SAMPLES, seed)
+    truth_indirect = ground_truth.indirect_irradiance(case.truth, points, POINT_PATHS, bounces, seed)
 
     progress("reference image", 2, 3)
-    with resized(pick_sensor(truth, sensor), size) as camera:
-        expected = ground_truth.image(truth, camera, spp, seed, ground_truth.path_depth(bounces))
+    with resized(pick_sensor(case.truth, sensor), size) as camera:
+        expected = ground_truth.image(case.truth, camera, spp, seed, ground_truth.path_depth(bounces))
         seconds["reference"] = time.perf_counter() - started
-        result = render_image(asset, truth, camera, IMAGE_SAMPLES, seed, irradiance)
-        covered = coverage(truth, camera, IMAGE_SAMPLES, seed) > 1 - 1e-4
+        result = case.image(camera, irradiance)
+        covered = coverage(case.truth, camera, IMAGE_SAMPLES, seed) > 1 - 1e-4
     progress("report", 3, 3)
 
     report = {
@@ -106,22 +122,87 @@ def compare(
         "scene": opened.source.path,
         "reference": reference,
         "left_out": asset.scene["left_out"],
-        "basis": asset.basis.kind,
-        "coefficients": len(asset.basis),
-        "directions": len(asset.directions),
         "bounces": asset.report["bounces"],
         "reference_bounces": "any number" if bounces is None else bounces,
-        "bounce_energy_left": asset.report.get("bounce_energy_left", 0.0) if bounces is None else 0.0,  # what the reference has more
-        "indirect_noise": asset.report.get("indirect_noise", 0.0),
-        "captured_variance": asset.report["captured_variance"],
-        "points": {"count": len(chosen)} | _errors(irradiance[chosen], at_points),
+        **case.told(chosen, truth_direct, truth_indirect),
+        "points": {"count": len(chosen)} | _errors(irradiance[chosen], truth_direct + truth_indirect),
         "image": _image_errors(result, expected, covered),
         "seconds": {name: round(value, 4) for name, value in seconds.items()},
     }
-    if chosen_light.point_lights:
-        report["local_light_error"] = measure_error(asset, chosen_light.point_lights, nearest, opened, seed)
     write_report(folder, report, result, expected.mean, covered)
     return report
+
+
+@dataclass(frozen=True, eq=False)
+class _Case:
+    """What is compared.
+
+    Parameters
+    ----------
+    truth : mi.Scene
+    irradiance : callable() -> (n, 3)
+    image : callable(sensor, irradiance) -> (h, w, 3)
+    told : callable(chosen, truth_direct, truth_indirect) -> dict
+        What a report says of this kind of asset.
+    """
+
+    truth: object
+    irradiance: Callable
+    image: Callable
+    told: Callable
+
+
+def _under_distant_light(asset, opened, light, rotate, reference, nearest, seed):
+    shown, chosen_light = turned_light(opened, light, rotate)
+    truth = lit_scene(opened.modelled() if reference == "modelled" else opened.mi_scene, shown)
+
+    def told(*_):
+        any_number = asset.reference_bounces is None
+        report = {
+            "basis": asset.basis.kind,
+            "coefficients": len(asset.basis),
+            "directions": len(asset.directions),
+            # What the reference has more:
+            "bounce_energy_left": asset.report.get("bounce_energy_left", 0.0) if any_number else 0.0,
+            "indirect_noise": asset.report.get("indirect_noise", 0.0),
+            "captured_variance": asset.report["captured_variance"],
+        }
+        if chosen_light.point_lights:
+            report["local_light_error"] = measure_error(asset, chosen_light.point_lights, nearest, opened, seed)
+        return report
+
+    return _Case(
+        truth,
+        lambda: asset.irradiance_from(*asset.project_light(chosen_light), chosen_light.point_lights, nearest),
+        lambda camera, irradiance: render_image(asset, truth, camera, IMAGE_SAMPLES, seed, irradiance),
+        told,
+    )
+
+
+def _under_local_lights(asset, opened, light, reference, direct, seed):
+    shown, keep_local, chosen_light = chosen_local_light(opened, light)
+    as_written = opened.mi_scene if keep_local else opened.unlit()
+    truth = lit_scene(opened.modelled(keep_local) if reference == "modelled" else as_written, shown, keep_local)
+
+    def told(chosen, truth_direct, truth_indirect):
+        components = {"direct": truth_direct, "indirect": truth_indirect}
+        return {
+            "coefficients": asset.settings["depth_coefficients"],
+            "directions": asset.settings["depth_directions"],
+            "transfer_coefficients": asset.settings["transfer_coefficients"],
+            "misclassified_visibility": asset.report["misclassified_visibility"],
+            "components": {
+                name: _errors(asset.irradiance(chosen_light, name)[chosen], expected) for name, expected in components.items()
+            },
+        }
+
+    def image(camera, irradiance):
+        if direct == "points":
+            return render_image(asset, truth, camera, IMAGE_SAMPLES, seed, irradiance)
+        indirect = asset.irradiance(chosen_light, "indirect")
+        return render_image(asset, truth, camera, IMAGE_SAMPLES, seed, indirect, emission_of(chosen_light))
+
+    return _Case(truth, lambda: asset.irradiance(chosen_light), image, told)
 
 
 def _made_folder(folder):

@@ -25,6 +25,10 @@ class Reference:
     mean: np.ndarray
     standard_error: np.ndarray
 
+    def __add__(self, other):
+        """The sum of two independent estimates."""
+        return Reference(self.mean + other.mean, np.hypot(self.standard_error, other.standard_error))
+
     @property
     def noise(self):
         """Relative RMSE that the reference has by itself: ‖standard error‖ / ‖mean‖."""
@@ -80,9 +84,7 @@ def compared_points(asset, most, seed=0):
 
 def irradiance(mi_scene, points, spp, paths, bounces=None, seed=0):
     """Irradiance at points, direct and after reflections; see `point_irradiance` and `indirect_irradiance`."""
-    direct = point_irradiance(mi_scene, points, spp, seed)
-    indirect = indirect_irradiance(mi_scene, points, paths, bounces, seed)
-    return Reference(direct.mean + indirect.mean, np.hypot(direct.standard_error, indirect.standard_error))
+    return point_irradiance(mi_scene, points, spp, seed) + indirect_irradiance(mi_scene, points, paths, bounces, seed)
 
 
 def path_depth(bounces):

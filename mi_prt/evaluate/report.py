@@ -30,7 +30,7 @@ th:first-child, td:first-child {{ text-align: left }} tr {{ border-bottom: 1px s
 </main>
 <table><tr><th></th><th>relative RMSE</th><th>beyond noise</th><th>bias</th><th>reference noise</th><th>PSNR</th><th>FLIP</th></tr>
 <tr><td>{count:,} points, irradiance</td>{points}<td></td><td></td></tr>
-<tr><td>image, radiance where geometry covers the pixel</td>{image}<td>{psnr:.1f} dB</td><td>{flip:.4f}</td></tr></table>
+{components}<tr><td>image, radiance where geometry covers the pixel</td>{image}<td>{psnr:.1f} dB</td><td>{flip:.4f}</td></tr></table>
 <h2>What makes the error</h2>
 <ul>{causes}</ul>
 </html>
@@ -96,19 +96,33 @@ def _page(report):
     return _PAGE.format(
         title=html.escape(Path(report["scene"] or "scene in memory").name),
         summary=html.escape(
-            f"{report['coefficients']} coefficients over {report['directions']:,} directions hold "
-            f"{report['captured_variance']:.2%} of the transport's variance. Relit in "
-            f"{1e3 * report['seconds']['relight']:.0f} ms (light averaged over the lattice included); "
-            f"the reference took {report['seconds']['reference']:.1f} s."
+            f"{_held(report)} Relit in {1e3 * report['seconds']['relight']:.0f} ms; the reference took "
+            f"{report['seconds']['reference']:.1f} s."
         ),
         reference=report["reference"],
         error_range=ERROR_RANGE,
         count=points["count"],
         points=cells(points),
+        components="".join(
+            f"<tr><td>{name} light of it</td>{cells(errors)}<td></td><td></td></tr>\n" for name, errors in report.get("components", {}).items()
+        ),
         image=cells(picture),
         psnr=picture["psnr"],
         flip=picture["flip"],
         causes="".join(f"<li>{html.escape(cause)}</li>" for cause in _causes(report)),
+    )
+
+
+def _held(report):
+    """What the asset holds, in words."""
+    if "transfer_coefficients" in report:
+        return (
+            f"{report['coefficients']} coefficients of depth in {report['directions']:,} directions at each sample, "
+            f"{report['transfer_coefficients']} of direct light on each cluster."
+        )
+    return (
+        f"{report['coefficients']} coefficients over {report['directions']:,} directions hold {report['captured_variance']:.2%} of the "
+        "transport's variance (relighting includes averaging light over the lattice)."
     )
 
 
@@ -118,6 +132,15 @@ def _causes(report):
         f"Reference noise: {report['points']['reference_noise']:.2%} at the points and "
         f"{report['image']['reference_noise']:.2%} in the image are Mitsuba's own; more spp lower them."
     )
+    yield from _local_causes(report) if "transfer_coefficients" in report else _distant_causes(report)
+    yield "Points: irradiance is interpolated between points; shadows narrower than their distance are lost."
+    for entry in report["left_out"]:
+        share = f" ({entry['share']:.0%} of the light those shapes scatter)" if entry["share"] is not None else ""
+        seen = "in the reference, not in the result" if report["reference"] == "full" else "in neither image"
+        yield f"Not modelled: {entry['what']}{share}, {seen}."
+
+
+def _distant_causes(report):
     if report["basis"] != "none":
         yield (
             f"Compression: {1 - report['captured_variance']:.2%} of the transport's variance is not in the basis ({report['basis']}); "
@@ -138,8 +161,14 @@ def _causes(report):
         f"Directions: light and shadows are averaged over cells of "
         f"{np.degrees(np.sqrt(4 * np.pi / report['directions'])):.1f}°, which blurs the shadow of a small sun."
     )
-    yield "Points: irradiance is interpolated between points; shadows narrower than their distance are lost."
-    for entry in report["left_out"]:
-        share = f" ({entry['share']:.0%} of the light those shapes scatter)" if entry["share"] is not None else ""
-        seen = "in the reference, not in the result" if report["reference"] == "full" else "in neither image"
-        yield f"Not modelled: {entry['what']}{share}, {seen}."
+
+
+def _local_causes(report):
+    yield (
+        f"Visibility: depth buffers of {report['directions']:,} directions err about {report['misclassified_visibility']:.1%} of the pairs of "
+        "a sample and a light, at the edges of shadows; more --depth-directions and --depth-coefficients lower it."
+    )
+    yield (
+        f"Reflections: {report['transfer_coefficients']} patterns on each cluster stand for direct light; more --transfer-coefficients, "
+        "smaller clusters and a smaller --transfer-error lower what they lose."
+    )

@@ -18,7 +18,6 @@ from ..scene.surface_table import SurfaceTable
 PARTICLES = 1 << 14  # on their way at a time
 STEPS = 64  # hits of each
 WARM_UP = 5  # of those, that do not count yet
-POOL = 1 << 16  # rays that particles start with
 OUTSIDE = 0.25  # share of the scene's extent by which flights that leave it are followed
 LINES = 1 << 16  # at a time
 CROSSINGS = 8  # of each line with surfaces, at a time
@@ -89,16 +88,15 @@ def trace_particles(scene, count, seed=0):
     mi = mitsuba()
     table, box = SurfaceTable(scene.surfaces), _outer_box(scene.mi_scene.bbox())
     offset = dr.opaque(mi.Float, _OFFSET * scene.scale)
-    pool = _source_rays(scene, seed)
     hits, flights, found = [], [], 0
     for run in range(_MOST_RUNS):
         random = mi.PCG32(size=PARTICLES, initstate=mi.UInt64(dr.opaque(mi.UInt32, seed + 7919 * run)))
+        pool = _source_rays(scene, PARTICLES * STEPS, seed + 7919 * run)
         kept = _Kept(PARTICLES * STEPS)
         lane = dr.arange(mi.UInt32, PARTICLES)
 
         def step(number, origin, direction, alive, random):
-            start = mi.UInt32(random.next_float32() * POOL)
-            fresh = [dr.gather(mi.Vector3f, rays, start, ~alive) for rays in pool]
+            fresh = [dr.gather(mi.Vector3f, rays, number * PARTICLES + lane, ~alive) for rays in pool]
             ray = mi.Ray3f(dr.select(alive, origin, fresh[0]), dr.select(alive, direction, fresh[1]))
             si = scene.occluders.ray_intersect(ray)
             normals, si.wi, reflects = facing(si, ray, scene.surfaces)
@@ -182,8 +180,8 @@ def cross_surfaces(scene, centre, radius, seed=0):
         block += 1
 
 
-def _source_rays(scene, seed):
-    """Origins and directions (flat mi.Float) of `POOL` rays that leave the sensors and local emitters of a scene, half of them each.
+def _source_rays(scene, count, seed):
+    """Origins and directions (flat mi.Float) of so many rays that leave the sensors and local emitters of a scene, half of them each.
 
     Where there are none, random lines through the scene.
     """
@@ -193,20 +191,27 @@ def _source_rays(scene, seed):
     rays = []
     if not kinds:
         box = scene.mi_scene.bbox()
-        sampler.seed(seed, POOL)
-        rays.append(_lines(sampler, box.center(), mi.Float(0.5 * np.linalg.norm(np.array(box.extents())))))
-    for kind in kinds:
+        sampler.seed(seed, count)
+        rays.append((_lines(sampler, box.center(), mi.Float(0.5 * np.linalg.norm(np.array(box.extents())))), count))
+    for k, kind in enumerate(kinds):
+        total = _share(count, k, len(kinds))
         for i, source in enumerate(kind):
-            share = POOL // len(kinds)
-            sampler.seed(seed + i, share * (i + 1) // len(kind) - share * i // len(kind))
-            rays.append(source.sample_ray(0.0, sampler.next_1d(), sampler.next_2d(), sampler.next_2d())[0])
-    return [_flat([getattr(ray, name) for ray in rays]) for name in ("o", "d")]
+            share = _share(total, i, len(kind))
+            if share:
+                sampler.seed(seed + i, share)
+                rays.append((source.sample_ray(0.0, sampler.next_1d(), sampler.next_2d(), sampler.next_2d())[0], share))
+    random = np.random.default_rng(seed).permutation(count)  # else some lanes would start from one source only
+    return [mi.Float(np.concatenate([_rows(getattr(ray, name), n) for ray, n in rays])[random].ravel()) for name in ("o", "d")]
 
 
-def _flat(vectors):
-    """Vectors one behind the other; of those that are the same in all lanes only one is there."""
-    counts = [max(len(component) for component in vector) for vector in vectors]
-    return mitsuba().Float(np.concatenate([np.broadcast_to(np.array(v).reshape(3, -1), (3, n)).T.ravel() for v, n in zip(vectors, counts)]))
+def _share(total, number, parts):
+    """How many of a total the part of a number gets, of so many equal parts."""
+    return total * (number + 1) // parts - total * number // parts
+
+
+def _rows(vectors, count):
+    """Vectors (count, 3); those that are the same in all lanes are there only once."""
+    return np.broadcast_to(np.array(vectors).reshape(3, -1), (3, count)).T
 
 
 def _lines(sampler, centre, radius):

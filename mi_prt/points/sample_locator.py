@@ -8,7 +8,8 @@ from ..runtime import mitsuba
 REACH = 2.5  # radii up to which a sample is found
 VOXEL = 1.5  # radii along the edge of a voxel
 MOST_VOXELS = 1 << 24
-SHARPNESS = 4  # power of the interpolation's weights: they fall to a half at 1 radius
+SHARPNESS = 4  # power of the interpolation's weights in distance: they fall to a half at 1 radius
+ALIGNMENT = 8  # power of their cosine between normals: surfaces at right angles do not mix
 
 
 class SampleLocator:
@@ -66,7 +67,7 @@ class SampleLocator:
 
         mi = mitsuba()
 
-        def visit(state, sample, distance):
+        def visit(state, sample, distance, cosine):
             nearest, least = state
             closer = distance < least
             return dr.select(closer, sample, nearest), dr.select(closer, distance, least)
@@ -94,9 +95,9 @@ class SampleLocator:
 
         mi = mitsuba()
 
-        def visit(state, sample, distance):
+        def visit(state, sample, distance, cosine):
             total, weights = state
-            weight = dr.maximum(1 - distance / dr.square(self._reach), 0) ** SHARPNESS
+            weight = dr.maximum(1 - distance / dr.square(self._reach), 0) ** SHARPNESS * dr.maximum(cosine, 0) ** ALIGNMENT
             return total + weight * dr.gather(mi.Color3f, values, sample, weight > 0), weights + weight
 
         total, weights = self._visit(position, normal, active, (mi.Color3f(0), mi.Float(0)), visit)
@@ -104,7 +105,7 @@ class SampleLocator:
         return dr.select(found, total / weights, 0), found
 
     def _visit(self, position, normal, active, state, visit):
-        """Fold `visit(state, sample, squared distance)` over the samples of each place's voxel."""
+        """Fold `visit(state, sample, squared distance, cosine between normals)` over the samples of each place's voxel."""
         import drjit as dr
 
         mi = mitsuba()
@@ -118,8 +119,9 @@ class SampleLocator:
             sample = dr.gather(mi.UInt32, self._samples, entry)
             p, n = dr.gather(mi.Vector4f, self._positions, sample), dr.gather(mi.Vector4f, self._normals, sample)
             moved = mi.Vector3f(position.x - p.x, position.y - p.y, position.z - p.z)
-            turned = self._radius * mi.Vector3f(normal.x - n.x, normal.y - n.y, normal.z - n.z)
-            return entry + 1, *visit(state, sample, dr.squared_norm(moved) + dr.squared_norm(turned))
+            turned = mi.Vector3f(normal.x - n.x, normal.y - n.y, normal.z - n.z)
+            angle = dr.squared_norm(turned)
+            return entry + 1, *visit(state, sample, dr.squared_norm(moved) + dr.square(self._radius) * angle, 1 - angle / 2)
 
         _, *state = dr.while_loop((first, *state), lambda entry, *_: entry < last, step)
         return state

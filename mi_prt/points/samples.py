@@ -84,6 +84,8 @@ def scatter_samples(scene, count, cluster_size, examples, seed=0):
         raise SettingsError(f"count {count} must be from 1 to {MOST_SAMPLES:,} samples")
     hits, flights = trace_particles(scene, CANDIDATES * count, seed)
     chosen, radius = thin(hits.positions, hits.normals, count, seed)
+    if not radius > 0:
+        raise SettingsError(f"count {count:,} is too high: particles find fewer places on surfaces that are apart from each other")
     hits = hits.at(chosen)
     roots, starts, order = _clusters(hits, max(1, round(count / cluster_size)), seed)
     hits = hits.at(order)

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from ..errors import SettingsError
 
 _SHRINK = 0.97  # of the radius, until there are enough
-_MARGIN = 1.03  # of the first radius over the one that is expected to be right
+_MARGIN = 1.1  # of the first radius over the one that is expected to be right
 _PILOT = 8192  # candidates that the radius is first told from
 _BATCH = 512  # candidates that are tried first
 
@@ -52,11 +52,9 @@ def thin(positions, normals, count, seed=0, dimension=2):
         raise SettingsError(f"{count:,} points are more than the {m:,} candidates that there are")
     order = np.random.default_rng(seed).permutation(m)  # candidates are tried one after the other
     radius = _expected_radius(positions, normals, count, order[:_PILOT], dimension)
-    points = embedded(positions, normals, radius)
     chosen = np.empty(0, np.int64)
-    free = np.full(m, np.inf)  # distance to the nearest of the chosen, as far as it is known
     while True:
-        chosen = _add(points, order, chosen, free, radius, count)
+        chosen = _add(embedded(positions, normals, radius), order, chosen, radius, count)
         if len(chosen) == count:
             return np.sort(chosen), float(radius)
         radius = radius * _SHRINK if radius > 1e-30 else 0.0
@@ -68,29 +66,29 @@ def _expected_radius(positions, normals, count, pilot, dimension):
     radius = float(np.linalg.norm(np.ptp(positions, axis=0))) / 4
     wanted = min(max(len(pilot) // 8, 2), count)
     while radius > 1e-30:
-        found = len(_add(embedded(positions, normals, radius), np.arange(len(pilot)), np.empty(0, np.int64), np.full(len(pilot), np.inf), radius))
+        found = len(_add(embedded(positions, normals, radius), np.arange(len(pilot)), np.empty(0, np.int64), radius))
         if found >= wanted:
             return _MARGIN * radius * (found / count) ** (1 / dimension)
         radius *= 0.8
     return 0.0
 
 
-def _add(points, order, chosen, free, radius, most=None):
+def _add(points, order, chosen, radius, most=None):
     """Choose more points in their order, until none is left that keeps its distance or there are `most`.
 
-    Points come in batches that double: crowds of them are struck out by the first few, before any pair of them is looked at. `free`
-    is brought up to date.
+    Points come in batches that double: crowds of them are struck out by the first few, before any pair of them is looked at.
     """
-    waiting = order[free[order] >= radius]
+    taken = np.zeros(len(points), bool)
+    taken[chosen] = True
+    waiting = order[~taken[order]]
     first, size = 0, _BATCH
     while first < len(waiting):
         batch = waiting[first : first + size]
         first, size = first + size, 2 * size
         if len(chosen):
-            free[batch] = np.minimum(free[batch], cKDTree(points[chosen]).query(points[batch], workers=-1)[0])
-            batch = batch[free[batch] >= radius]
+            distance, _ = cKDTree(points[chosen]).query(points[batch], distance_upper_bound=max(radius, 1e-300), workers=-1)
+            batch = batch[distance >= radius]
         new = batch[_keep_distance(points[batch], radius)]
-        free[new] = -1
         chosen = np.concatenate([chosen, new])
         if most is not None and len(chosen) >= most:
             return chosen[:most]

@@ -145,11 +145,13 @@ def facing(si, ray, surfaces):
     import drjit as dr
 
     mi = mitsuba()
-    outer = dr.mulsign(si.n, dr.dot(si.n, si.sh_frame.n))
+    # Meshes can hold vertex normals that are zero or NaN; no comparison with these is true.
+    shading = dr.select(dr.squared_norm(si.sh_frame.n) > 0.25, si.sh_frame.n, si.n)
+    outer = dr.mulsign(si.n, dr.dot(si.n, shading))
     side = dr.select(dr.dot(outer, ray.d) < 0, mi.Float(1), -1)
     bsdf = modelled_bsdf(si, surfaces)
     reflects = (side > 0) | mi.has_flag(bsdf.flags(), mi.BSDFFlags.BackSide)
-    return Facing(outer * side, si.sh_frame.n * side), mi.Vector3f(0, 0, side), reflects
+    return Facing(outer * side, shading * side), mi.Vector3f(0, 0, side), reflects
 
 
 def _model(bsdf, left_out):

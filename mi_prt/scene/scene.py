@@ -136,7 +136,10 @@ class Scene:
 
         Embree's robust mode is off in scenes by default; rays that start at vertices then leak through shared edges.
         """
-        return rebuilt_scene([c for _, c in self._children if isinstance(c, mitsuba().Shape)])
+        mi = mitsuba()
+        shapes = [c for _, c in self._children if isinstance(c, mi.Shape)]
+        # A mesh without faces has no arrays to read from, which Dr.Jit refuses.
+        return rebuilt_scene([s for s in shapes if not (s.is_mesh() and s.face_count() == 0)])
 
     @cached_property
     def hash(self):

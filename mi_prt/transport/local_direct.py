@@ -12,10 +12,12 @@ from ..lighting.places import Places
 from ..runtime import mitsuba
 from .examples import raised_height
 
-TOLERANCE = 0.03  # share of its distance by which a light may lie behind what the depth buffer shows
+TOLERANCE = 0.1  # share of its distance by which a light may lie behind what the depth buffer shows
+BEHIND = 0.03  # the same for points behind the surface that is nearest to the light, so that none leaks through it
 CLEARANCE = 0.25  # share of its distance by which a light is taken to lie off the nearest surface, on its own side of it
 SOFTNESS = 0.15  # share of the distance over which the comparison goes from dark to lit
 FAR = 0.8  # share of the extent from which on all light is equally far
+CELLS = 1.0  # of the depth buffer, in which a light is seen off the nearest surface at least, so that its neighbours see past that
 ON_SURFACE = 1e-3  # radii of samples from a surface, below which a place is on it
 
 
@@ -48,6 +50,7 @@ class LocalDirect:
         axes = (np.pad(axis, ((0, 0), (0, 1))) for axis in np.moveaxis(rotations.astype(np.float32), 2, 0))
         self._points = mi.Float(np.hstack([points.positions, points.areas[:, None], *axes]).ravel())
         self._far = dr.opaque(mi.Float, FAR * depth.extent)
+        self._cell = dr.opaque(mi.Float, CELLS * (2 * np.pi / self._directions) ** 0.5)
 
     def irradiance(self, emission):
         """Irradiance at the points, and the same averaged over their areas.
@@ -75,12 +78,14 @@ class LocalDirect:
         def add(number, at_point, averaged):
             toward, intensity, side = places.sent(number, position)
             distance, height = dr.norm(toward), dr.dot(toward, axes[2])
-            direction = toward * dr.select(distance > 0, 1 / distance, 0)
             lit = (height > 0) & (dr.max(intensity) > 0)
             # A light near a surface is taken farther off it, on the side where it stands: depth is not as exact as to tell them apart.
-            pushed = toward + mi.Vector3f(side.x, side.y, side.z) * dr.maximum(CLEARANCE * distance - side.w, 0)
-            compared = dr.minimum(dr.norm(pushed) * (1 - TOLERANCE), self._far)
-            local = mi.Vector3f(*(dr.dot(direction, x) for x in axes))
+            normal = mi.Vector3f(side.x, side.y, side.z)
+            in_front = dr.dot(toward, normal) < 0
+            pushed = toward + normal * dr.maximum(CLEARANCE * distance - side.w, 0)
+            compared = dr.minimum(dr.norm(pushed) * (1 - dr.select(in_front, mi.Float(TOLERANCE), BEHIND)), self._far)
+            seen_in = toward + normal * dr.maximum(self._cell * distance - side.w, 0)
+            local = dr.normalize(mi.Vector3f(*(dr.dot(seen_in, x) for x in axes)))
             visible = dr.if_stmt((point, local, compared), lit, self._visibility, lambda *_: mi.Float(0))
             squared = dr.square(distance)
             raised = raised_height(height, area)
