@@ -25,6 +25,8 @@ app = typer.Typer(
     "mi-prt relight teapot.prt -o teapot.png --rotate y:45",
 )
 
+_SAMPLES = "With --points samples"
+
 LOG_SECONDS = 20  # between lines of progress where there is no terminal
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else.")]
@@ -40,9 +42,18 @@ Lights = Annotated[
     typer.Option(
         "--light",
         metavar="SPEC",
-        help="point:x,y,z:r,g,b (W/sr), directional:dx,dy,dz:r,g,b (direction of travel, W/m²), envmap:FILE or "
-        "envmap:FILE:y:30, or scene (its own distant light); one number is grey. May be repeated: lights add up, also to --envmap.",
+        help="point:x,y,z:r,g,b (W/sr), spot:x,y,z:dx,dy,dz:r,g,b[:CUTOFF[:BEAM]] (W/sr, degrees), "
+        "area:x,y,z:ux,uy,uz:vx,vy,vz:r,g,b[:SAMPLES] (centre, edges, W/(m² sr)), directional:dx,dy,dz:r,g,b (direction of travel, "
+        "W/m²), envmap:FILE or envmap:FILE:y:30, or scene (its own light); one number is grey. May be repeated: lights add up, also to "
+        "--envmap.",
     ),
+]
+Component = Annotated[
+    str, typer.Option("--component", metavar="total|direct|indirect", help="Of light, with --points samples.")
+]
+Direct = Annotated[
+    str,
+    typer.Option("--direct", metavar="points|pixels", help="Direct light at the points, or by shadow rays at pixels; with --points samples."),
 ]
 Nearest = Annotated[int, typer.Option("--nearest", metavar="K", help="Directions that stand for a local light.")]
 Rotate = Annotated[
@@ -84,6 +95,33 @@ Denoise = Annotated[
     bool, typer.Option("--denoise/--no-denoise", help="Take noise that can be told out of reflected light.")
 ]
 Seed = Annotated[int, typer.Option("--seed", help="Same seed, same result.")]
+PointKind = Annotated[
+    str,
+    typer.Option("--points", metavar="vertices|samples", help="vertices for distant light, samples for lights that move inside the scene."),
+]
+Count = Annotated[int, typer.Option("--count", metavar="N", help="Samples.", rich_help_panel=_SAMPLES)]
+ClusterSize = Annotated[int, typer.Option("--cluster-size", metavar="N", help="Samples in a cluster, on average.", rich_help_panel=_SAMPLES)]
+DepthDirections = Annotated[
+    int, typer.Option("--depth-directions", metavar="N", help="Of each sample's depth buffer.", rich_help_panel=_SAMPLES)
+]
+DepthCoefficients = Annotated[
+    int, typer.Option("--depth-coefficients", metavar="D", help="Components of depth buffers on a cluster.", rich_help_panel=_SAMPLES)
+]
+ExampleLights = Annotated[
+    int, typer.Option("--example-lights", metavar="N", help="Lights that the basis of direct light is made from.", rich_help_panel=_SAMPLES)
+]
+TransferCoefficients = Annotated[
+    int, typer.Option("--transfer-coefficients", metavar="D", help="Components of direct light on a cluster.", rich_help_panel=_SAMPLES)
+]
+TransferError = Annotated[
+    float,
+    typer.Option(
+        "--transfer-error", metavar="SHARE", help="Of indirect light, that may be lost by leaving small things out.", rich_help_panel=_SAMPLES
+    ),
+]
+Quantize = Annotated[
+    str, typer.Option("--quantize", metavar="16|none", help="Integers of 16 bits, or float32.", rich_help_panel=_SAMPLES)
+]
 
 
 @app.command(epilog="Example: mi-prt doctor --json")
@@ -103,7 +141,9 @@ def doctor(as_json: Json = False):
 
 @app.command(epilog="Example: mi-prt info scenes/still_life.xml --directions cubemap:16 --json")
 def info(
+    context: typer.Context,
     path: Annotated[Path, typer.Argument(help="A scene (XML) or an asset.")],
+    points: PointKind = "vertices",
     directions: Directions = "cubemap:32",
     basis: Basis = "pca",
     coefficients: Coefficients = None,
@@ -114,6 +154,14 @@ def info(
     indirect: Indirect = "solve",
     paths_per_point: Paths = "auto",
     denoise: Denoise = True,
+    count: Count = 45_000,
+    cluster_size: ClusterSize = 1000,
+    depth_directions: DepthDirections = 2016,
+    depth_coefficients: DepthCoefficients = 50,
+    example_lights: ExampleLights = 1000,
+    transfer_coefficients: TransferCoefficients = 20,
+    transfer_error: TransferError = 0.01,
+    quantize: Quantize = "16",
     define: Define = None,
     as_json: Json = False,
 ):
@@ -125,31 +173,21 @@ def info(
 
         found = description.describe_asset(load(path))
     else:
-        found = description.describe(
-            path,
-            _parameters(define),
-            directions=directions,
-            basis=basis,
-            coefficients=_count("coefficients", coefficients),
-            variance=variance,
-            edge_length=edge_length,
-            rays_per_direction=rays_per_direction,
-            bounces=_count("bounces", bounces),
-            indirect=indirect,
-            paths_per_point=_count("paths-per-point", paths_per_point),
-            denoise=denoise,
-        )
+        found = description.describe(path, _parameters(define), points, **_settings(context, points))
     _print_json(found) if as_json else _print_nested(found)
 
 
 @app.command(
     epilog="Examples: mi-prt precompute scenes/teapot.xml -o teapot.prt --coefficients 96 -D spp=16\n\n"
     "mi-prt precompute scenes/cornell_sky.xml -o cornell.prt --bounces 3 --paths-per-point 512\n\n"
-    "mi-prt precompute scenes/teapot.xml -o teapot.prt --coefficients auto --variance 0.98 --max-memory 2G --resume"
+    "mi-prt precompute scenes/teapot.xml -o teapot.prt --coefficients auto --variance 0.98 --max-memory 2G --resume\n\n"
+    "mi-prt precompute scenes/room.xml -o room.prt --points samples --count 45000"
 )
 def precompute(
+    context: typer.Context,
     scene: Annotated[Path, typer.Argument(help="A Mitsuba XML file.")],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="FILE", help="The asset to write.")],
+    points: PointKind = "vertices",
     directions: Directions = "cubemap:32",
     basis: Basis = "pca",
     coefficients: Coefficients = None,
@@ -160,6 +198,14 @@ def precompute(
     indirect: Indirect = "solve",
     paths_per_point: Paths = "auto",
     denoise: Denoise = True,
+    count: Count = 45_000,
+    cluster_size: ClusterSize = 1000,
+    depth_directions: DepthDirections = 2016,
+    depth_coefficients: DepthCoefficients = 50,
+    example_lights: ExampleLights = 1000,
+    transfer_coefficients: TransferCoefficients = 20,
+    transfer_error: TransferError = 0.01,
+    quantize: Quantize = "16",
     seed: Seed = 0,
     resume: Annotated[bool, typer.Option("--resume", help="Continue an interrupted run of this file, if there is one.")] = False,
     max_memory: Annotated[
@@ -188,41 +234,25 @@ def precompute(
             output,
             resume,
             max_memory,
-            directions=directions,
-            basis=basis,
-            coefficients=_count("coefficients", coefficients),
-            variance=variance,
-            edge_length=edge_length,
-            rays_per_direction=rays_per_direction,
-            bounces=_count("bounces", bounces),
-            indirect=indirect,
-            paths_per_point=_count("paths-per-point", paths_per_point),
-            denoise=denoise,
-            seed=seed,
+            points,
+            **_settings(context, points),
         )
     cost["seconds"]["total"] = round(time.perf_counter() - started, 4)
     for entry in asset.scene["left_out"]:
         _note(f"not modelled: {entry['what']}" + (f" ({', '.join(entry['shapes'][:5])})" if entry["shapes"] else ""))
-    result = {
-        "points": len(asset.points),
-        "directions": len(asset.directions),
-        "coefficients": len(asset.basis),
-        "bounces": asset.report["bounces"],
-        "captured_variance": asset.report["captured_variance"],
-        "relative_error": asset.report["relative_error"],
-        "bytes": output.stat().st_size,
-        **cost,
-    }
+    result = {"points": len(asset.points), **_summary(asset), "bytes": output.stat().st_size, **cost}
     _print_json(result) if as_json else _print_nested({"wrote": str(output)} | result)
 
 
 @app.command(
     epilog="Examples: mi-prt relight teapot.prt -o teapot.png --envmap sky.exr --rotate y:90 --size 640x480\n\n"
-    "mi-prt relight teapot.prt -o lamps.png --light scene --light point:3,4,2:60,50,40 --light envmap:sky.exr:y:90"
+    "mi-prt relight teapot.prt -o lamps.png --light scene --light point:3,4,2:60,50,40 --light envmap:sky.exr:y:90\n\n"
+    "mi-prt relight room.prt -o lamp.png --light point:0,1.5,0:8,7,6 --component indirect\n\n"
+    "mi-prt relight room.prt -o walk.mp4 --light point:0,1.5,0:8,7,6 --light-path '-1,1.5,0 1,1.5,0 1,1.5,1' --renderer raster"
 )
 def relight(
     asset_path: Annotated[Path, typer.Argument(metavar="FILE", help="An asset.")],
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="OUT", help=".exr, .png, .ply or .npz")],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="OUT", help=".exr, .png, .ply or .npz; of a film .mp4, .gif or frame-%03d.png")],
     envmap: Environment = None,
     light: Lights = None,
     nearest: Nearest = 1,
@@ -231,23 +261,38 @@ def relight(
     size: Size = None,
     renderer: Annotated[str, typer.Option("--renderer", metavar="mitsuba|raster")] = "mitsuba",
     spp: Annotated[int, typer.Option("--spp", help="Samples per pixel of mitsuba's image.")] = 64,
+    component: Component = "total",
+    direct: Direct = "points",
+    light_path: Annotated[
+        Optional[str],
+        typer.Option("--light-path", metavar="'x,y,z x,y,z …'", help="Move the first --light along these places; OUT is a film."),
+    ] = None,
+    frames: Annotated[int, typer.Option("--frames", metavar="N", help="Of the film.")] = 48,
+    fps: Annotated[int, typer.Option("--fps", help="Frames of the film in a second.")] = 25,
     scene: OtherScene = None,
     threads: Threads = None,
     as_json: Json = False,
 ):
-    """Relight an asset: an image, a mesh with vertex radiance, or plain arrays."""
+    """Relight an asset: an image, a mesh with vertex radiance, plain arrays, or a film of a light that moves."""
     from .opening import load
     from .relight import relight_to_file
 
     _set_threads(threads)
     chosen = _light(envmap, light)
-    result = relight_to_file(
-        load(asset_path), output, chosen, _rotation(rotate), scene, sensor, _size(size), renderer, spp, nearest
-    )
+    asset = load(asset_path)
+    if light_path is not None:
+        result = _film(asset, output, light_path, chosen, rotate, frames, fps, scene, sensor, _size(size), renderer, spp, component, direct)
+    else:
+        result = relight_to_file(
+            asset, output, chosen, _rotation(rotate), scene, sensor, _size(size), renderer, spp, nearest, component, direct
+        )
     _print_json(result) if as_json else _print_nested({"wrote": str(output)} | result)
 
 
-@app.command(epilog="Example: mi-prt compare teapot.prt -o teapot-report --spp 512 --json")
+@app.command(
+    epilog="Examples: mi-prt compare teapot.prt -o teapot-report --spp 512 --json\n\n"
+    "mi-prt compare room.prt -o room-report --light point:0,1.5,0:8,7,6"
+)
 def compare(
     asset_path: Annotated[Path, typer.Argument(metavar="FILE", help="An asset.")],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the report.")],
@@ -259,6 +304,7 @@ def compare(
     size: Size = None,
     spp: Annotated[int, typer.Option("--spp", help="Samples per pixel of the reference.")] = 256,
     reference: Annotated[str, typer.Option("--reference", metavar="modelled|full")] = "modelled",
+    direct: Direct = "points",
     scene: OtherScene = None,
     seed: Seed = 0,
     threads: Threads = None,
@@ -284,6 +330,7 @@ def compare(
             seed,
             progress,
             nearest,
+            direct,
         )
     _print_json(result) if as_json else _print_nested({"wrote": str(output / "index.html")} | result)
 
@@ -303,6 +350,20 @@ def main(arguments=None):
     except MemoryError:
         print("mi-prt: out of memory: use fewer --directions or a longer --edge-length, or set --max-memory", file=sys.stderr)
         sys.exit(1)
+
+
+def _film(asset, output, places, light, rotate, frames, fps, scene, sensor, size, renderer, spp, component, direct):
+    from .meshless_asset import MeshlessAsset
+    from .relight_local import animate_local
+    from .render.animation import light_path
+
+    if not isinstance(asset, MeshlessAsset) or rotate is not None:
+        raise SettingsError("--light-path moves a light inside the scene: it takes an asset of --points samples, and no --rotate")
+    with _progress() as progress:
+        path = light_path(places)
+        return animate_local(
+            asset, output, path, frames, fps, light, scene, sensor, size, renderer, spp, component, direct, progress
+        )
 
 
 # --- what the user passes ------------------------------------------------------------------------------------------
@@ -330,6 +391,35 @@ def _count(option, text):
         return int(text)
     except ValueError:
         raise SettingsError(f"--{option} {text} is neither a whole number nor auto") from None
+
+
+def _settings(context, points):
+    """The settings of a kind of points, from all options of a command; those of the other kind must not be given."""
+    from .precompute import POINTS
+    from .settings import names_of
+
+    if points not in POINTS:
+        raise SettingsError(f"--points {points} is not known: use {' or '.join(POINTS)}")
+    own = names_of(POINTS[points][0])
+    every = {name for kind, _ in POINTS.values() for name in names_of(kind)}
+    given = {name for name in every & set(context.params) if context.get_parameter_source(name).name == "COMMANDLINE"}
+    foreign = sorted(given - set(own))
+    if foreign:
+        raise SettingsError(f"--{foreign[0].replace('_', '-')} means nothing with --points {points}: leave it out")
+    counts = {"coefficients", "bounces", "paths_per_point"}
+    values = {name: context.params[name] for name in own if name in context.params}
+    return {name: _count(name.replace("_", "-"), value) if name in counts else value for name, value in values.items()}
+
+
+def _summary(asset):
+    """What `precompute` tells of an asset."""
+    from .meshless_asset import MeshlessAsset
+
+    names = ["bounces", "captured_variance", "relative_error"]
+    if not isinstance(asset, MeshlessAsset):
+        return {"directions": len(asset.directions), "coefficients": len(asset.basis)} | {name: asset.report[name] for name in names}
+    left_aside = ("rays", "channels", "no_own_light")
+    return {"clusters": len(asset.samples.roots)} | {name: value for name, value in asset.report.items() if name not in left_aside}
 
 
 def _light(envmap, specs):

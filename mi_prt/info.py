@@ -11,12 +11,14 @@ from .directions import parse_directions
 from .indirect import surface_shares
 from .indirect import GREY
 from .memory import resident_bytes
+from .meshless_asset import MeshlessAsset
+from .meshless_info import describe_meshless, describe_meshless_asset
 from .parallel import BLOCK_ROWS, map_chunks
 from .points.points import POINT_BUDGET, sample_points
 from .provenance import left_out
 from .room import LANE_BYTES, POINT_BYTES, expected_channels, held_coefficient_bytes
 from .scene.scene import open_scene
-from .settings import DIRECT_ONLY, Settings
+from .settings import DIRECT_ONLY, MeshlessSettings, Settings
 from .transport.direct import LANES, find_buried, sample_direct
 from .transport.hops import blocked_share
 from .transport.interreflection import BOUNCE_TOLERANCE
@@ -32,7 +34,7 @@ AUTO_COEFFICIENTS = 64  # what `auto` is predicted with: how many it takes is kn
 BASIS_WORK = {"pca": (3, 20), "sh": (1, 2), "haar": (3, 0), "haar-shared": (2, 1), "none": (0, 0)}
 
 
-def describe(source, parameters=None, **settings):
+def describe(source, parameters=None, points="vertices", **settings):
     """What precomputing a scene requires, would use, leaves out and costs.
 
     The cost is predicted from a probe: 256 of the scene's points are traced and compressed.
@@ -41,14 +43,17 @@ def describe(source, parameters=None, **settings):
     ----------
     source : path, dict, mi.Scene
     parameters : dict, optional
+    points : 'vertices' or 'samples'
     **settings
-        Fields of `Settings`.
+        Fields of `Settings` or `MeshlessSettings`.
 
     Returns
     -------
     dict
         requires{…}, settings{… each with value and reason}, left_out[…], predicted{seconds, peak_memory_bytes, bytes}.
     """
+    if points == "samples":
+        return describe_meshless(open_scene(source, parameters), MeshlessSettings(**settings))
     settings = Settings(**settings)
     started = time.perf_counter()
     scene = open_scene(source, parameters)
@@ -119,6 +124,8 @@ def describe_asset(asset):
     `storage` has bytes as predicted by the formula of the paper's section 7.1 (see `storage_bytes`) and as measured: of the arrays
     in the file and of the file.
     """
+    if isinstance(asset, MeshlessAsset):
+        return describe_meshless_asset(asset)
     n, s, d = len(asset.points), len(asset.directions), len(asset.basis)
     relighting, projection = storage_bytes(asset.basis.kind, n, s, d, asset.settings["rays_per_direction"], asset.channels)
     measured = {

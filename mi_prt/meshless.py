@@ -98,13 +98,13 @@ class MeshlessPrecomputation:
             "versions": versions(),
         }
 
-    def run(self, workspace, description, clock):
-        """The asset."""
+    def run(self, workspace, description, lap):
+        """The asset; `lap` is called with the name of each stage at its end."""
         settings = self.settings
         senders = self._senders(workspace) if settings.bounces != 0 else None
-        clock.lap("example lights")
+        lap("example lights")
         parts = self._clusters(workspace, senders)
-        clock.lap("clusters")
+        lap("clusters")
         depth = DepthBuffers(
             np.stack([part["mean"] for part in parts]),
             np.stack([part["vectors"] for part in parts]),
@@ -116,7 +116,7 @@ class MeshlessPrecomputation:
         depth, transfer = as_stored(depth, transfer, self.samples.starts, settings.quantize)
         report |= self._quantization(exact, (depth, transfer), senders)
         report |= self._visibility(depth)
-        clock.lap("transfer")
+        lap("transfer")
         return MeshlessAsset(
             self.samples,
             depth,

@@ -4,7 +4,7 @@ import hashlib
 import time
 from collections.abc import Callable
 from contextlib import closing, contextmanager
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +27,7 @@ from .provenance import describe_scene
 from .room import INDIRECT_LANE_BYTES, LANE_BYTES, Room, held_coefficient_bytes
 from .runtime import count_kernels, peak_memory_bytes, versions
 from .scene.scene import open_scene
-from .settings import MeshlessSettings, Settings
+from .settings import MeshlessSettings, Settings, names_of
 from .transport.direct import DirectSampler, find_buried
 from .transport.hops import blocked_share
 from .workspace import durable, temporary
@@ -87,7 +87,7 @@ def measure(scene, parameters=None, progress=None, output=None, resume=False, ma
     if points not in POINTS:
         raise SettingsError(f"points '{points}' are not known: use {' or '.join(POINTS)}")
     kind, run = POINTS[points]
-    known = [field.name for field in fields(kind)]
+    known = names_of(kind)
     foreign = [name for name in settings if name not in known]
     if foreign:
         raise SettingsError(f"{foreign[0]} is no setting of points '{points}', which has {', '.join(known)}")
@@ -126,7 +126,7 @@ def _for_local_lights(scene, description, settings, progress, output, resume, li
     job = MeshlessPrecomputation(scene, settings, progress, limit)
     clock.lap("samples")
     with _workspace(output, job.identity(), resume) as workspace:
-        asset = job.run(workspace, description, clock)
+        asset = job.run(workspace, description, clock.lap)
         if output is not None:
             asset.save(output, workspace.folder)
             clock.lap("write")

@@ -1,6 +1,6 @@
 """What a precomputation is asked to do."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -231,3 +231,8 @@ class MeshlessSettings:
         object.__setattr__(self, "quantize", str(self.quantize))
         if self.quantize not in QUANTIZATIONS:
             raise SettingsError(f"quantize '{self.quantize}' is not known: use {' or '.join(QUANTIZATIONS)}")
+
+
+def names_of(settings):
+    """Names of the fields of a class of settings."""
+    return [field.name for field in fields(settings)]

@@ -4,7 +4,7 @@ import numpy as np
 
 from ..runtime import mitsuba
 
-_FLOATS = 16  # of a place
+_OWN = 12  # floats of a place
 
 
 class Places:
@@ -13,7 +13,7 @@ class Places:
     Parameters
     ----------
     emission : Emission
-    extra : (k, 4), optional
+    extra : (k, 4·m), optional
         Numbers beside each place that its user reads again.
     """
 
@@ -22,7 +22,8 @@ class Places:
 
         mi = mitsuba()
         columns = (emission.positions, emission.axes, emission.intensity, *(getattr(emission, x)[:, None] for x in ("cosine", "cutoff", "beam")))
-        extra = np.zeros((len(emission), 4)) if extra is None else extra
+        extra = np.empty((len(emission), 0)) if extra is None else extra
+        self._loads = (_OWN + extra.shape[1]) // 4
         self._floats = mi.Float(np.hstack([*columns, extra]).astype(np.float32).ravel())
         self.count = dr.opaque(mi.UInt32, len(emission))
 
@@ -40,12 +41,12 @@ class Places:
             From the position to the place, metres.
         intensity : mi.Color3f
             W/sr in the direction of the position.
-        extra : mi.Vector4f
+        extra : list of mi.Vector4f
         """
         import drjit as dr
 
         mi = mitsuba()
-        a, b, c, extra = (dr.gather(mi.Vector4f, self._floats, _FLOATS // 4 * number + i) for i in range(4))
+        a, b, c, *extra = (dr.gather(mi.Vector4f, self._floats, self._loads * number + i) for i in range(self._loads))
         toward = mi.Point3f(a.x, a.y, a.z) - position
         distance = dr.norm(toward)
         cosine = dr.select(distance > 0, -dr.dot(toward, mi.Vector3f(a.w, b.x, b.y)) / distance, 0)

@@ -8,6 +8,7 @@ from ..runtime import mitsuba
 REACH = 2.5  # radii up to which a sample is found
 VOXEL = 1.5  # radii along the edge of a voxel
 MOST_VOXELS = 1 << 24
+BEHIND = 0.1  # radii behind a place from which on samples are not seen from there
 SHARPNESS = 4  # power of the interpolation's weights in distance: they fall to a half at 1 radius
 ALIGNMENT = 8  # power of their cosine between normals: surfaces at right angles do not mix
 
@@ -48,7 +49,7 @@ class SampleLocator:
         self._inverse_edge = dr.opaque(mi.Float, 1 / edge)
         self._radius, self._reach = dr.opaque(mi.Float, radius), dr.opaque(mi.Float, reach)
 
-    def nearest(self, position, normal, active=True):
+    def nearest(self, position, normal, active=True, seen_from=None):
         """The nearest sample.
 
         Parameters
@@ -56,6 +57,8 @@ class SampleLocator:
         position : mi.Point3f
         normal : mi.Normal3f
         active : mi.Bool
+        seen_from : (mi.Point3f, mi.Vector3f), optional
+            A place and its normal: samples behind it do not count. Beside a thin wall they are nearest on its other side.
 
         Returns
         -------
@@ -67,9 +70,12 @@ class SampleLocator:
 
         mi = mitsuba()
 
-        def visit(state, sample, distance, cosine):
+        def visit(state, sample, place, distance, cosine):
             nearest, least = state
             closer = distance < least
+            if seen_from is not None:
+                origin, up = seen_from
+                closer &= dr.dot(place - origin, up) > -BEHIND * self._radius
             return dr.select(closer, sample, nearest), dr.select(closer, distance, least)
 
         index, squared = self._visit(position, normal, active, (mi.UInt32(0), mi.Float(dr.square(self._reach))), visit)
@@ -95,7 +101,7 @@ class SampleLocator:
 
         mi = mitsuba()
 
-        def visit(state, sample, distance, cosine):
+        def visit(state, sample, place, distance, cosine):
             total, weights = state
             weight = dr.maximum(1 - distance / dr.square(self._reach), 0) ** SHARPNESS * dr.maximum(cosine, 0) ** ALIGNMENT
             return total + weight * dr.gather(mi.Color3f, values, sample, weight > 0), weights + weight
@@ -105,7 +111,7 @@ class SampleLocator:
         return dr.select(found, total / weights, 0), found
 
     def _visit(self, position, normal, active, state, visit):
-        """Fold `visit(state, sample, squared distance, cosine between normals)` over the samples of each place's voxel."""
+        """Fold `visit(state, sample, its place, squared distance, cosine between normals)` over the samples of each place's voxel."""
         import drjit as dr
 
         mi = mitsuba()
@@ -118,10 +124,11 @@ class SampleLocator:
         def step(entry, *state):
             sample = dr.gather(mi.UInt32, self._samples, entry)
             p, n = dr.gather(mi.Vector4f, self._positions, sample), dr.gather(mi.Vector4f, self._normals, sample)
-            moved = mi.Vector3f(position.x - p.x, position.y - p.y, position.z - p.z)
+            place = mi.Point3f(p.x, p.y, p.z)
             turned = mi.Vector3f(normal.x - n.x, normal.y - n.y, normal.z - n.z)
             angle = dr.squared_norm(turned)
-            return entry + 1, *visit(state, sample, dr.squared_norm(moved) + dr.square(self._radius) * angle, 1 - angle / 2)
+            distance = dr.squared_norm(position - place) + dr.square(self._radius) * angle
+            return entry + 1, *visit(state, sample, place, distance, 1 - angle / 2)
 
         _, *state = dr.while_loop((first, *state), lambda entry, *_: entry < last, step)
         return state

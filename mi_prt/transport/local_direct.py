@@ -18,6 +18,10 @@ CLEARANCE = 0.25  # share of its distance by which a light is taken to lie off t
 SOFTNESS = 0.15  # share of the distance over which the comparison goes from dark to lit
 FAR = 0.8  # share of the extent from which on all light is equally far
 CELLS = 1.0  # of the depth buffer, in which a light is seen off the nearest surface at least, so that its neighbours see past that
+NEIGHBOURS = 256  # samples around a place that tell what it stands over
+UNDER = 2.0  # radii that a sample may lie beside a place which stands over it
+ROOM = 0.75  # share of the way to the nearest surface ahead by which a place may be moved
+AHEAD = 0.2  # cosine to the normal of that, from which on other samples are ahead of a place
 ON_SURFACE = 1e-3  # radii of samples from a surface, below which a place is on it
 
 
@@ -76,15 +80,17 @@ class LocalDirect:
         axes = [mi.Vector3f(axis.x, axis.y, axis.z) for axis in axes]
 
         def add(number, at_point, averaged):
-            toward, intensity, side = places.sent(number, position)
+            toward, intensity, (side, room) = places.sent(number, position)
             distance, height = dr.norm(toward), dr.dot(toward, axes[2])
             lit = (height > 0) & (dr.max(intensity) > 0)
             # A light near a surface is taken farther off it, on the side where it stands: depth is not as exact as to tell them apart.
             normal = mi.Vector3f(side.x, side.y, side.z)
             in_front = dr.dot(toward, normal) < 0
-            pushed = toward + normal * dr.maximum(CLEARANCE * distance - side.w, 0)
-            compared = dr.minimum(dr.norm(pushed) * (1 - dr.select(in_front, mi.Float(TOLERANCE), BEHIND)), self._far)
-            seen_in = toward + normal * dr.maximum(self._cell * distance - side.w, 0)
+            free = dr.select(in_front, room.x, dr.inf)
+            pushed = toward + normal * dr.maximum(dr.minimum(CLEARANCE * distance, free) - side.w, 0)
+            tolerated = dr.minimum(dr.select(in_front, mi.Float(TOLERANCE), BEHIND) * distance, free)
+            compared = dr.minimum(dr.norm(pushed) - tolerated, self._far)
+            seen_in = toward + normal * dr.maximum(dr.minimum(self._cell * distance, free) - side.w, 0)
             local = dr.normalize(mi.Vector3f(*(dr.dot(seen_in, x) for x in axes)))
             visible = dr.if_stmt((point, local, compared), lit, self._visibility, lambda *_: mi.Float(0))
             squared = dr.square(distance)
@@ -102,15 +108,25 @@ class LocalDirect:
         return (np.minimum(np.array(x).T, largest) for x in sums)
 
     def _sides(self, emission):
-        """For each place (k, 4): the normal of the nearest surface, on the side where the place is, and how far from it that is."""
-        distance, nearest = self._tree.query(emission.positions)
-        normals = self._normals[nearest]
-        height = np.einsum("ij,ij->i", emission.positions - self._tree.data[nearest], normals)
+        """For each place (k, 8): the normal of the surface that it stands over, on its side; how far from that it is; and how far it may be
+        moved."""
+        k = min(NEIGHBOURS, self._count)
+        distance, near = (x.reshape(len(emission), -1) for x in self._tree.query(emission.positions, k, workers=-1))
+        normals = self._normals[near]
+        height = np.einsum("ijk,ijk->ij", emission.positions[:, None] - self._tree.data[near], normals)
+        beside = np.sqrt(np.maximum(distance**2 - height**2, 0))
+        # Not just the nearest sample: outside an edge of a room that is one of a wall that the place does not stand over.
+        under = np.argmin(np.where(beside < UNDER * self._radius, distance, np.inf), axis=1)
+        row = np.arange(len(emission))
+        normal, height = normals[row, under], height[row, under]
         # A place on a surface that shines to one side stands on that side.
         on_surface = (np.abs(height) < ON_SURFACE * self._radius) & (emission.cosine > 0)
-        side = np.where(on_surface, np.einsum("ij,ij->i", emission.axes, normals), height)
-        clearance = np.maximum(np.abs(height), distance - self._radius)
-        return np.hstack([np.where(side < 0, -1, 1)[:, None] * normals, clearance[:, None]])
+        side = np.where(on_surface, np.einsum("ij,ij->i", emission.axes, normal), height)
+        away = np.where(side < 0, -1, 1)[:, None] * normal
+        ahead = np.einsum("ijk,ik->ij", self._tree.data[near] - emission.positions[:, None], away) > AHEAD * distance
+        room = np.where(ahead, distance, distance[:, -1:]).min(axis=1) * ROOM
+        columns = (away, np.abs(height)[:, None], room[:, None], np.zeros((len(emission), 3)))
+        return np.hstack(columns)
 
     def _visibility(self, point, local, compared):
         """Share of a light that is visible from points, in local directions and at a distance."""

@@ -46,7 +46,7 @@ def within_budget(matrix, examples, budget):
 
     Rows, then single entries, are dropped in the order of the squared irradiance that they bring, until what is dropped would make a share
     of the whole; each gets half of the budget. Rows are those of an orthonormal basis, so their squares add up; entries are taken as
-    independent.
+    independent, and where that was too much, fewer are dropped.
 
     Parameters
     ----------
@@ -72,9 +72,15 @@ def within_budget(matrix, examples, budget):
     ranks = (kept * np.arange(1, q + 1)).max(axis=1)
     reduced = matrix * (np.arange(q) < ranks[:, None])[..., None, None]
     strength = np.einsum("ij,ij->i", examples, examples, dtype=np.float64)
-    reduced[_smallest(np.square(reduced, dtype=np.float64) * strength[:, None], budget**2 / 2 * total)] = 0
-    lost = np.stack([(matrix - reduced)[..., i].reshape(c * q, k) @ examples for i in range(channels)], axis=-1)
-    return reduced, ranks, float(np.sqrt(np.square(lost, dtype=np.float64).sum() / total)) if total else 0.0
+    squares = np.square(reduced, dtype=np.float64) * strength[:, None]
+    share = budget**2 / 2
+    while True:
+        kept = np.where(_smallest(squares, share * total), 0, reduced)
+        lost = np.stack([(matrix - kept)[..., i].reshape(c * q, k) @ examples for i in range(channels)], axis=-1)
+        error = float(np.sqrt(np.square(lost, dtype=np.float64).sum() / total)) if total else 0.0
+        if error <= budget or share == 0:
+            return kept, ranks, error
+        share = share / 2 if share > budget**2 / 1000 else 0.0
 
 
 def _smallest(squares, budget):
