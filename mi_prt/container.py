@@ -80,7 +80,7 @@ def opened(path):
             if not file.attrs.get("complete"):
                 raise AssetError(f"asset '{path}' is incomplete: precompute it again")
             yield file, next(kind for kind, number in VERSIONS.items() if number == version)
-    except (OSError, KeyError, TypeError, ValueError) as error:
+    except (OSError, KeyError, TypeError, ValueError, IndexError) as error:
         if isinstance(error, AssetError):
             raise
         reason = " ".join(str(error).split())

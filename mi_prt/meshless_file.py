@@ -163,9 +163,9 @@ def read(file, path):
     )
     transfer = None
     if "transfer" in file:
-        transfer = Transfer(
-            _restored(file, "transfer/encoder", starts), _restored(file, "transfer/receivers", starts), _restored_matrix(file)
-        )
+        encoder, receivers = (_restored(file, f"transfer/{name}", starts) for name in ("encoder", "receivers"))
+        c = len(starts) - 1
+        transfer = Transfer(encoder, receivers, _restored_matrix(file, (c, receivers.shape[1], c * encoder.shape[1])))
     _check_shapes(samples, depth, transfer)
     own = Emission(**{name: file[f"lights/{name}"][()] for name in _EMISSION})
     return {"samples": samples, "depth": depth, "transfer": transfer, "own_light": own, "path": path.absolute(), **texts}
@@ -175,21 +175,32 @@ def _restored(file, name, starts=None):
     """An array as float32; `starts` where there is a scale for each cluster."""
     values = file[name][()]
     if f"{name}_scale" not in file:
+        if values.dtype != np.float32:
+            raise ValueError(f"{name} has no scale")
         return values
     scale = file[f"{name}_scale"][()]
     return Quantized(values, scale if starts is None else np.repeat(scale, np.diff(starts), axis=0)).values
 
 
-def _restored_matrix(file):
+def _restored_matrix(file, expected):
+    """M, whose first three sides are as expected."""
     c, q, k, channels = file["transfer/shape"][()]
+    if (c, q, k) != expected or channels not in (1, 3):
+        raise ValueError(f"transfer/shape is {c, q, k, channels} where {expected} is expected")
     rows = file["transfer/rows"][()]
+    if rows.size and rows.max() >= c * q:
+        raise ValueError("transfer/rows are beyond the matrix")
     matrix = np.zeros((c * q, k * channels), np.float32)
     if "transfer/entries" in file:
         values, ends = file["transfer/entries"][()], file["transfer/ends"][()]
         if "transfer/matrix_scale" in file:
             values = values * np.repeat(file["transfer/matrix_scale"][()][:, 0], np.diff(ends))
-        sparse = (values.astype(np.float32), file["transfer/columns"][()].astype(np.int64), ends)
-        matrix[rows] = scipy.sparse.csr_array(sparse, (len(rows), k * channels)).toarray()
+        elif values.dtype != np.float32:
+            raise ValueError("transfer/entries have no scale")
+        columns = file["transfer/columns"][()].astype(np.int64)
+        sparse = scipy.sparse.csr_array((values.astype(np.float32), columns, ends), (len(rows), k * channels))
+        sparse.check_format(full_check=True)
+        matrix[rows] = sparse.toarray()
     else:
         matrix[rows] = _restored(file, "transfer/matrix")
     return matrix.reshape(c, q, k, channels)
@@ -205,6 +216,7 @@ def _check_shapes(samples, depth, transfer):
         "points/uv": (points.uv, (n, 2)),
         **{f"points/{name}": (getattr(points, name), (n,)) for name in ("areas", "surface")},
         "clusters/starts": (samples.starts, (c + 1,)),
+        "clusters/roots": (samples.roots, (c,)),
         "depth/means": (depth.means, (c, directions)),
         "depth/vectors": (depth.vectors, (c, directions, d)),
         "depth/coefficients": (depth.coefficients, (n, d)),
@@ -222,3 +234,5 @@ def _check_shapes(samples, depth, transfer):
             raise ValueError(f"{name} is of shape {array.shape} instead of {shape}")
     if samples.starts[0] != 0 or samples.starts[-1] != n or (np.diff(samples.starts) <= 0).any():
         raise ValueError("clusters/starts do not divide the points")
+    if (samples.roots < 0).any() or (samples.roots >= n).any():
+        raise ValueError("clusters/roots are not points")

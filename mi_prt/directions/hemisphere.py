@@ -91,7 +91,7 @@ def frames(normals, reference):
     """
     reference, normals = np.asarray(reference, np.float64), np.asarray(normals, np.float64)
     normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-    z = reference[:, 2]
+    z = reference[:, 2] / np.linalg.norm(reference[:, 2])
     # A half turn about z and one about the middle between z and the normal together take z to the normal the shortest way.
     middle = normals + z
     length = np.linalg.norm(middle, axis=1, keepdims=True)

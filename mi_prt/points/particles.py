@@ -100,7 +100,8 @@ def trace_particles(scene, count, seed=0):
             ray = mi.Ray3f(dr.select(alive, origin, fresh[0]), dr.select(alive, direction, fresh[1]))
             si = scene.occluders.ray_intersect(ray)
             normals, si.wi, reflects = facing(si, ray, scene.surfaces)
-            met = si.is_valid() & reflects
+            # Off an edge a ray can start beyond the other wall, and meet the outer side of that.
+            met = si.is_valid() & reflects & (si.t > offset)
             end = dr.select(si.is_valid(), si.p, ray(box.leave(ray)))
             kept.write(number * PARTICLES + lane, scene, table, si, normals, met, ray.o, end)
             cosine = mi.warp.square_to_cosine_hemisphere(mi.Point2f(random.next_float32(), random.next_float32()))
@@ -187,7 +188,8 @@ def _source_rays(scene, count, seed):
     """
     mi = mitsuba()
     sampler = mi.load_dict({"type": "independent"})
-    kinds = [kind for kind in (list(scene.mi_scene.sensors()), list(scene.local_emitters)) if kind]
+    kinds = [[s for s in kind if _sends_rays(s)] for kind in (scene.mi_scene.sensors(), scene.local_emitters)]
+    kinds = [kind for kind in kinds if kind]
     rays = []
     if not kinds:
         box = scene.mi_scene.bbox()
@@ -202,6 +204,16 @@ def _source_rays(scene, count, seed):
                 rays.append((source.sample_ray(0.0, sampler.next_1d(), sampler.next_2d(), sampler.next_2d())[0], share))
     random = np.random.default_rng(seed).permutation(count)  # else some lanes would start from one source only
     return [mi.Float(np.concatenate([_rows(getattr(ray, name), n) for ray, n in rays])[random].ravel()) for name in ("o", "d")]
+
+
+def _sends_rays(source):
+    """Whether Mitsuba can sample rays of a sensor or emitter; it cannot of those that measure at a surface."""
+    mi = mitsuba()
+    try:
+        source.sample_ray(0.0, mi.Float(0.5), mi.Point2f(0.5), mi.Point2f(0.5))
+    except RuntimeError:
+        return False
+    return True
 
 
 def _share(total, number, parts):

@@ -16,7 +16,7 @@ CANDIDATES = 16  # particles' hits for each sample that stays
 CROSSINGS = 16  # random places on surfaces for each sample, that measure its area
 COVERED = 1.25  # radii from a sample up to which a surface counts as reachable
 MOST_SAMPLES = 1_000_000
-_MOST_BLOCKS = 4096
+_MOST_BLOCKS = 512
 _FREE_CANDIDATES = 8  # for each place in free space that stays
 
 

@@ -11,7 +11,8 @@ from scipy.spatial import cKDTree
 from ..errors import SettingsError
 
 _SHRINK = 0.97  # of the radius, until there are enough
-_MARGIN = 1.1  # of the first radius over the one that is expected to be right
+_GROW = 1.06  # of a radius that is too small
+_MARGIN = 1.06  # of the first radius over the one that is expected to be right
 _PILOT = 8192  # candidates that the radius is first told from
 _BATCH = 512  # candidates that are tried first
 
@@ -52,7 +53,11 @@ def thin(positions, normals, count, seed=0, dimension=2):
         raise SettingsError(f"{count:,} points are more than the {m:,} candidates that there are")
     order = np.random.default_rng(seed).permutation(m)  # candidates are tried one after the other
     radius = _expected_radius(positions, normals, count, order[:_PILOT], dimension)
-    chosen = np.empty(0, np.int64)
+    nothing = chosen = np.empty(0, np.int64)
+    # Too small at first would leave holes: points end before every candidate is near one.
+    extent = float(np.linalg.norm(np.ptp(positions, axis=0)))
+    while m > count and 0 < radius < extent and len(_add(embedded(positions, normals, radius), order, nothing, radius, count)) == count:
+        radius *= _GROW
     while True:
         chosen = _add(embedded(positions, normals, radius), order, chosen, radius, count)
         if len(chosen) == count:

@@ -101,6 +101,9 @@ class Scene:
         self.surfaces = tuple(self._list_surfaces())
         if not self.surfaces:
             raise SceneError("the scene holds no shapes: there is nothing to light")
+        empty = [s.name for s in self.surfaces if s.kind == "mesh" and s.shape.face_count() == 0]
+        if empty:  # Dr.Jit cannot read from arrays without entries
+            raise SceneError(f"the mesh '{empty[0]}' has no faces: remove it from the scene")
         emitters = mi_scene.emitters()
         is_distant = [mi.has_flag(e.flags(), mi.EmitterFlags.Infinite) for e in emitters]
         self.distant_emitters = tuple(e for e, distant in zip(emitters, is_distant) if distant)
@@ -136,10 +139,7 @@ class Scene:
 
         Embree's robust mode is off in scenes by default; rays that start at vertices then leak through shared edges.
         """
-        mi = mitsuba()
-        shapes = [c for _, c in self._children if isinstance(c, mi.Shape)]
-        # A mesh without faces has no arrays to read from, which Dr.Jit refuses.
-        return rebuilt_scene([s for s in shapes if not (s.is_mesh() and s.face_count() == 0)])
+        return rebuilt_scene([c for _, c in self._children if isinstance(c, mitsuba().Shape)])
 
     @cached_property
     def hash(self):

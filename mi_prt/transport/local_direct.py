@@ -20,7 +20,7 @@ FAR = 0.8  # share of the extent from which on all light is equally far
 CELLS = 1.0  # of the depth buffer, in which a light is seen off the nearest surface at least, so that its neighbours see past that
 NEIGHBOURS = 256  # samples around a place that tell what it stands over
 UNDER = 2.0  # radii that a sample may lie beside a place which stands over it
-ROOM = 0.75  # share of the way to the nearest surface ahead by which a place may be moved
+ROOM = 0.5  # share of the way to the nearest surface ahead by which a place may be moved, and as much be tolerated
 AHEAD = 0.2  # cosine to the normal of that, from which on other samples are ahead of a place
 ON_SURFACE = 1e-3  # radii of samples from a surface, below which a place is on it
 

@@ -121,7 +121,7 @@ def all_reflections(hop, bounces=None):
 
 def _spectral_radius(matrix):
     """About the largest modulus of the eigenvalues, by powers: ‖Bᵏv‖^(1/k) ends there."""
-    vector = np.ones(len(matrix)) / max(len(matrix), 1) ** 0.5
+    vector = np.random.default_rng(0).standard_normal(len(matrix))  # any that no symmetry of the matrix can take to zero
     growth = []
     for _ in range(_POWER_STEPS):
         vector = matrix @ vector
