@@ -197,8 +197,8 @@ class MeshlessSettings:
     depth_directions: int = 2016
     depth_coefficients: int = 50
     example_lights: int = 1000
-    transfer_coefficients: int = 20
-    transfer_error: float = 0.01
+    transfer_coefficients: int = 32
+    transfer_error: float = 0.02
     quantize: str = "16"
     bounces: int | str = "auto"
     seed: int = 0

@@ -12,7 +12,7 @@ from .points import Points
 from .sample_locator import SampleLocator
 from .thinning import embedded, thin
 
-CANDIDATES = 16  # particles' hits for each sample that stays
+CANDIDATES = 24  # particles' hits for each sample that stays
 CROSSINGS = 16  # random places on surfaces for each sample, that measure its area
 COVERED = 1.25  # radii from a sample up to which a surface counts as reachable
 MOST_SAMPLES = 1_000_000
@@ -83,6 +83,8 @@ def scatter_samples(scene, count, cluster_size, examples, seed=0):
     if not 1 <= count <= MOST_SAMPLES:
         raise SettingsError(f"count {count} must be from 1 to {MOST_SAMPLES:,} samples")
     hits, flights = trace_particles(scene, CANDIDATES * count, seed)
+    # A run of particles may find far more than are needed to leave no hole.
+    hits = hits.at(np.random.default_rng(seed).permutation(len(hits))[: CANDIDATES * count])
     chosen, radius = thin(hits.positions, hits.normals, count, seed)
     if not radius > 0:
         raise SettingsError(f"count {count:,} is too high: particles find fewer places on surfaces that are apart from each other")
@@ -112,7 +114,8 @@ def _clusters(hits, count, seed):
     """Roots (c,) as positions in the new order, starts (c + 1,), and the order of points by cluster.
 
     Roots are thinned like samples, at a larger radius, and each sample belongs to the nearest. No sample is farther from its root than
-    about the radius, so that its normal is within 60° of the root's: no cluster holds both sides of a wall.
+    about the radius, so that its normal is within 60° of the root's: no cluster holds both sides of a wall. (With fewer clusters than there
+    are such directions, six in a room, that cannot be.)
     """
     roots, radius = thin(hits.positions, hits.normals, count, seed)
     tree = cKDTree(embedded(hits.positions[roots], hits.normals[roots], radius))
