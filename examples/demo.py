@@ -1,4 +1,4 @@
-"""The main job on one scene: precompute, relight under a turning sky, draw in two ways, compare with Mitsuba.
+"""The main job on one scene: precompute, relight under a turning sky, draw in two ways, compare with Mitsuba; and a lamp that moves inside.
 
 Usage: python examples/demo.py [--out out/demo] [--frames 24]
 """
@@ -11,12 +11,16 @@ from PIL import Image
 
 import mi_prt
 from mi_prt.lighting.scene_light import lit_scene, scene_light
+from mi_prt.relight_local import animate_local
+from mi_prt.render.animation import light_path
 from mi_prt.render.display import display, exposure
 from mi_prt.render.image import render_image, resized
 from mi_prt.scene.scene import open_scene
 
 ROOT = Path(__file__).resolve().parent.parent
 SCENE = ROOT / "scenes" / "still_life.xml"
+ROOM = ROOT / "scenes" / "room.xml"
+WALK = "1.6,1.7,1.6 -0.6,1.7,1.5 0.1,1.6,0.2 0.1,1.6,-1.4 -1.6,1.7,-1.8"  # through the doorway
 FRAME_SIZE = (400, 300)
 
 
@@ -51,6 +55,9 @@ def main():
         f"   image: relative RMSE {errors['relative_rmse']:.2%} (reference noise {errors['reference_noise']:.2%}), "
         f"bias {errors['bias']:+.2%}, PSNR {errors['psnr']:.1f} dB, FLIP {errors['flip']:.3f}"
     )
+    say(f"5. carry a lamp through the two rooms of {ROOM.name}")
+    walk = arguments.out / "walk.gif"
+    carried_lamp(walk, arguments.frames)
     say(f"done in {time.perf_counter() - started:.0f} s")
     for what, path in (
         ("asset", arguments.out / "still_life.prt"),
@@ -58,6 +65,7 @@ def main():
         ("raster image", raster),
         ("comparison, side by side", arguments.out / "report" / "side_by_side.png"),
         ("report page", arguments.out / "report" / "index.html"),
+        ("carried lamp", walk),
     ):
         say(f"  {what}: {path}")
 
@@ -80,6 +88,17 @@ def turning_sky(asset, path, frames):
         pictures.append(Image.fromarray((shown * 255 + 0.5).astype("uint8")))
     pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=80, loop=0)
     say(f"   turn, project and relight {len(asset.points):,} points: {1e3 * sorted(relighting)[frames // 2]:.1f} ms a frame")
+
+
+def carried_lamp(path, frames):
+    """Write an animation of a point light on its way from one room to the other, direct and reflected light."""
+    begun = time.perf_counter()
+    asset = mi_prt.precompute(ROOM, points="samples", count=12_000, cluster_size=300, depth_directions=1024)
+    say(f"   {len(asset.points):,} samples, {len(asset.samples.roots)} clusters, {time.perf_counter() - begun:.1f} s")
+    way = light_path(WALK)
+    lamp = mi_prt.PointLight(way.positions(1)[0], (3.2, 2.9, 2.5))
+    told = animate_local(asset, path, way, frames, fps=12, light=lamp, size=(480, 300), renderer="raster")
+    say(f"   direct light and all reflections: {1e3 * told['seconds']['relight'] / frames:.1f} ms a frame")
 
 
 def say(text):

@@ -25,7 +25,8 @@ class Places:
         extra = np.empty((len(emission), 0)) if extra is None else extra
         self._loads = (_OWN + extra.shape[1]) // 4
         self._floats = mi.Float(np.hstack([*columns, extra]).astype(np.float32).ravel())
-        self.count = dr.opaque(mi.UInt32, len(emission))
+        # Gathered, like all else: a number by itself compiles another kernel where its memory is aligned otherwise.
+        self.count = dr.gather(mi.UInt32, mi.UInt32([len(emission), 0]), mi.UInt32(0))
 
     def sent(self, number, position):
         """What a place sends to positions.

@@ -101,7 +101,7 @@ class LocalDirect:
             factor = dr.select(lit, visible, 0)
             return number + 1, at_point + intensity * (factor * here), averaged + intensity * (factor * spread)
 
-        state = (dr.opaque(mi.UInt32, 0), mi.Color3f(0), mi.Color3f(0))
+        state = (mi.UInt32(0), mi.Color3f(0), mi.Color3f(0))
         _, *sums = dr.while_loop(state, lambda number, *_: number < places.count, add)
         dr.eval(sums)
         largest = np.finfo(np.float32).max
