@@ -164,7 +164,7 @@ def test_comparison_tells_components(asset, tmp_path):
     assert report["points"]["relative_rmse_beyond_noise"] < 0.12
     assert report["components"]["direct"]["reference_noise"] == 0
     assert "direct light of it" in (tmp_path / "r" / "index.html").read_text()
-    assert json.loads((tmp_path / "r" / "report.json").read_text())["transfer_coefficients"] == 20
+    assert json.loads((tmp_path / "r" / "report.json").read_text())["transfer_coefficients"] == 32
 
 
 @pytest.mark.parametrize("renderer", ["mitsuba", "raster"])
