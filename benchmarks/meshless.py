@@ -65,7 +65,7 @@ class Effort:
     encoded_lights: int = 24
     furnace: dict = field(default_factory=lambda: {"count": 5000, "cluster_size": 500})
     trade: dict = field(default_factory=lambda: {"count": 10_000, "cluster_size": 222})  # as many clusters as with the defaults
-    trade_counts: tuple = (5000, 10_000, 20_000, 45_000, 90_000)
+    trade_counts: tuple = (5000, 10_000, 20_000, 45_000)
     trade_lights: int = 12
     repeat: int = 50  # of what is timed
 

@@ -1,8 +1,12 @@
 """Transfer matrices between the coefficients of direct light and those of indirect irradiance, made small by an error budget."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
+import scipy.sparse
+
+SPARSE_BELOW = 0.3  # share of entries that are not zero, below which a sparse product is faster
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,16 +29,19 @@ class Transfer:
     receivers: np.ndarray
     matrix: np.ndarray
 
+    @cached_property
+    def _channels(self):
+        """The matrix (c·q, c·d) of each channel, sparse where most of it is zero: reading it is what a product costs."""
+        c, q, columns, channels = self.matrix.shape
+        matrices = [np.ascontiguousarray(self.matrix[..., i].reshape(c * q, columns)) for i in range(channels)]
+        return [scipy.sparse.csr_array(m) if np.count_nonzero(m) < SPARSE_BELOW * m.size else m for m in matrices]
+
     def indirect(self, irradiance, clusters):
         """Indirect irradiance (n, 3) float32 of direct irradiance (n, 3)."""
-        c, q, columns, channels = self.matrix.shape
+        c, q, _, channels = self.matrix.shape
         light = np.concatenate([self.encoder[cluster].T @ irradiance[cluster] for cluster in clusters])
-        flat = self.matrix.reshape(c * q, columns, channels)
-        if channels == 1:
-            received = flat[..., 0] @ light
-        else:
-            received = np.stack([flat[..., i] @ light[:, i] for i in range(3)], axis=-1)
-        received = received.reshape(c, q, 3)
+        products = (matrix @ light[:, i if channels == 3 else slice(None)] for i, matrix in enumerate(self._channels))
+        received = (np.stack(list(products), axis=-1) if channels == 3 else next(products)).reshape(c, q, 3)
         result = np.empty_like(irradiance)
         for cluster, coefficients in zip(clusters, received):
             result[cluster] = self.receivers[cluster] @ coefficients
