@@ -32,7 +32,7 @@ class SenderBasis:
     coefficients : (c, d, e) float32
         Those of the examples, each example scaled to a reflected flux of 1.
     captured : float
-        Share of the examples' squared irradiance (each scaled, weighted by what is reflected) that the patterns capture.
+        Share of the squared response to the examples that the patterns capture.
     """
 
     encoder: np.ndarray
