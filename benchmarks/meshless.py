@@ -64,9 +64,9 @@ class Effort:
     encoded_clusters: int = 8  # of each scene
     encoded_lights: int = 24
     furnace: dict = field(default_factory=lambda: {"count": 5000, "cluster_size": 500})
-    trade: dict = field(default_factory=lambda: {"count": 10_000, "cluster_size": 222})  # as many clusters as with the defaults
-    trade_counts: tuple = (5000, 10_000, 20_000, 45_000)
-    trade_lights: int = 12
+    trade: dict = field(default_factory=lambda: {"count": 5000, "cluster_size": 111})  # as many clusters as with the defaults
+    trade_counts: tuple = (2500, 5000, 10_000, 20_000)
+    trade_lights: int = 8
     repeat: int = 50  # of what is timed
 
 
@@ -765,13 +765,13 @@ def _trade_values():
     if effort is QUICK:
         return {"depth_coefficients": (10, 50), "transfer_coefficients": (5, 20), "pca basis": (5, 20), "count": effort.trade_counts, "quantize": ("none", "16")}
     return {
-        "depth_coefficients": (10, 20, 50, 100, 200),
-        "depth_directions": (504, 1024, 2016, 4032),
-        "transfer_coefficients": (5, 10, 20, 40),
-        "pca basis": (5, 10, 20, 40),
-        "cluster_size": (56, 111, 222, 444, 889),  # 250 … 4000 of 45,000
+        "depth_coefficients": (10, 50, 200),
+        "depth_directions": (504, 2016),
+        "transfer_coefficients": (5, 10, 20, 32),
+        "pca basis": (10, 32),
+        "cluster_size": (28, 111, 444),  # 250, 1000, 4000 of 45,000
         "count": effort.trade_counts,
-        "transfer_error": (0.0, 0.003, 0.01, 0.03, 0.1),
+        "transfer_error": (0.0, 0.02, 0.1),
         "quantize": ("none", "16"),
     }
 

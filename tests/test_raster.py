@@ -16,6 +16,7 @@ from conftest import diffuse, disk, emitted, rectangle, scene, sky_of, sphere
 import mi_prt
 from mi_prt.errors import SceneError, SettingsError
 from mi_prt.lighting.scene_light import scene_light
+from mi_prt.points.interpolate import PatchInterpolator
 from mi_prt.points.points import sample_points
 from mi_prt.render.display import display, exposure
 from mi_prt.render.image import render_image, resized
@@ -43,6 +44,7 @@ def opened(edge_length=0.25, sensor=None, **parts):
     points = sample_points(opened, edge_length)
     lit = np.full((len(points), 3), np.pi, np.float32)
     asset = SimpleNamespace(points=points, buried=np.zeros(len(points), bool), irradiance=lambda light: lit, path=None)
+    asset.interpolator = lambda scene: PatchInterpolator(scene, points, asset.buried)
     return opened, asset, opened.mi_scene.sensors()[0]
 
 
