@@ -863,7 +863,7 @@ def _draw_trade(curves, pictures, name):
         for colour, key in enumerate(("direct", "indirect", "total", "anywhere")):
             axis.plot(values, [row[key] for _, row in curves[setting]], f"C{colour}o-", ms=4, label=key)
         if setting == "transfer_coefficients":
-            axis.plot(values, [row["indirect"] for _, row in curves["pca basis"]], "C1x:", label="indirect, pca")
+            axis.plot(*zip(*((value, row["indirect"]) for value, row in curves["pca basis"])), "C1x:", label="indirect, pca")
         axis.set_xscale("symlog", linthresh=values[1] if values[0] == 0 else values[0])
         axis.set_xticks(values, [f"{value:g}" for value in values], minor=False), axis.set_xticks([], minor=True)
         axis.set(yscale="log", xlabel=setting.replace("_", " ")), axis.grid(alpha=0.3, which="both")
