@@ -122,7 +122,7 @@ make_venv() {
 works() {
     advice=$("$venv/bin/python" - "$1" 2>&1 <<'EOF'
 import sys
-from mi_prt import doctor
+from mi_prt.system import doctor
 
 check = getattr(doctor, f"check_{sys.argv[1]}")()
 if check.status == "fault":

@@ -24,7 +24,7 @@ from mi_prt.lighting.cells import cell_radiance
 from mi_prt import LightWarning
 from mi_prt.lighting.scene_light import lit_scene
 from mi_prt.points.points import sample_points
-from mi_prt.runtime import mitsuba
+from mi_prt.system.runtime import mitsuba
 from mi_prt.scene.scene import open_scene
 from mi_prt.transport.direct import sample_direct
 

@@ -25,14 +25,14 @@ from mi_prt.basis.target import Target
 from mi_prt.directions import Cubemap
 from mi_prt.evaluate import metrics
 from mi_prt.evaluate.ground_truth import image, point_irradiance
-from mi_prt.info import storage_bytes
+from mi_prt.precompute.info import storage_bytes
 from mi_prt.lighting.cells import cell_radiance
 from mi_prt.lighting.lattice import on_lattice
 from mi_prt.lighting.scene_light import lit_scene, scene_light
 from mi_prt.points.points import sample_points
 from mi_prt.render.display import display, exposure
 from mi_prt.render.image import coverage, pick_sensor, render_image, resized
-from mi_prt.runtime import mitsuba
+from mi_prt.system.runtime import mitsuba
 from mi_prt.scene.scene import open_scene
 from mi_prt.transport.direct import sample_direct
 from page import ROOT, saved, write_page
@@ -241,7 +241,7 @@ def shading(assets, pictures):
         yield "|---|---:|---:|---:|---:|---:|---:|"
         at_points = None
         for kind, components in [("pca", d) for d in SHADING] + [("sh", 36), ("haar", 36), ("none", None)]:
-            asset = mi_prt.precompute(path, basis=kind, coefficients=components, rays_per_direction=4, bounces=0)
+            asset = mi_prt.precompute.precompute(path, basis=kind, coefficients=components, rays_per_direction=4, bounces=0)
             if at_points is None:
                 chosen = np.sort(np.random.default_rng(0).permutation(len(asset.points))[:3000])
                 at_points = point_irradiance(truth, asset.points.at(chosen), POINT_SAMPLES)
@@ -346,11 +346,11 @@ def memory_table(assets, pictures):
     yield "|---|---:|---:|---:|---:|---:|---:|---:|"
     with tempfile.TemporaryDirectory() as folder:
         for mesh in PAPER_MESHES:
-            asset = mi_prt.precompute(
+            asset = mi_prt.precompute.precompute(
                 {"type": "scene", "mesh": {"type": "ply", "filename": str(assets / "meshes" / f"{mesh}.ply")}},
                 output=Path(folder) / f"{mesh}.prt",
             )
-            storage = mi_prt.info.describe_asset(asset)["storage"]
+            storage = mi_prt.precompute.info.describe_asset(asset)["storage"]
             predicted, measured = storage["predicted"], storage["measured"]
             figures = [predicted["relighting"], measured["coefficients"], predicted["projection"], measured["basis"], measured["file"]]
             ratio = predicted["relighting"] / measured["file"]
@@ -393,7 +393,7 @@ def local_lights(assets, pictures):
     )
     sampled = Sampled(assets, "bunny", True)
     yield "| height, m | inside the hull | pca, k = 1: RMSE | bias | k = 4: RMSE | bias | none, k = 1: RMSE | bias |\n|---:|---|" + "---:|" * 6
-    pca, none = (mi_prt.precompute(sampled.scene.mi_scene, **settings) for settings in (dict(coefficients=192, bounces=0), dict(basis="none")))
+    pca, none = (mi_prt.precompute.precompute(sampled.scene.mi_scene, **settings) for settings in (dict(coefficients=192, bounces=0), dict(basis="none")))
     chosen = np.sort(np.random.default_rng(0).permutation(len(pca.points))[:4000])
     for height in (20.0, 8.0, 4.0, 2.5, 1.6, 1.1, 0.6):
         light = mi_prt.PointLight((1.2, height, 0.8), 100.0)

@@ -17,9 +17,10 @@ from PIL import Image
 import mi_prt
 from mi_prt import LightWarning
 from mi_prt.directions import parse_directions
-from mi_prt.evaluate import ground_truth, metrics
+from mi_prt.evaluate import ground_truth
+from mi_prt.evaluate import metrics
 from mi_prt.lighting.scene_light import lit_scene, scene_light
-from mi_prt.precompute import measure
+from mi_prt.precompute.precompute import measure
 from mi_prt.render.display import display, exposure
 from mi_prt.render.image import pick_sensor, render_image, resized
 from mi_prt.scene.scene import open_scene
@@ -73,7 +74,7 @@ def methods(assets, pictures):
             for rays in RAYS:
                 settings = {"coefficients": 64, "bounces": BOUNCES, "indirect": way, "paths_per_point": rays}
                 asset, cost = measure(path, **settings)
-                plain = mi_prt.precompute(path, denoise=False, **settings)
+                plain = mi_prt.precompute.precompute(path, denoise=False, **settings)
                 errors = [_error(a.irradiance(light)[chosen] - without, truth) for a in (asset, plain)]
                 bias = metrics.relative_bias(asset.irradiance(light)[chosen] - without, truth.mean)
                 curve.append(errors)
@@ -104,11 +105,11 @@ def noise(assets, pictures):
     yield "| | rays per point | noise | estimated | with denoising | noise that the filter lets through |\n|---|---:|---:|---:|---:|---:|"
     path = ROOT / "scenes" / "cornell_sky.xml"
     settings = {"basis": "haar-shared", "coefficients": 192, "bounces": BOUNCES, "edge_length": 0.1}
-    direct = mi_prt.precompute(path, **settings | {"bounces": 0})
+    direct = mi_prt.precompute.precompute(path, **settings | {"bounces": 0})
     kept = ~direct.buried
 
     def reflected(**more):
-        asset = mi_prt.precompute(path, **settings | more)
+        asset = mi_prt.precompute.precompute(path, **settings | more)
         return asset, (asset.coefficients - direct.coefficients[:, None])[kept]
 
     _, exact = reflected(paths_per_point=8192, denoise=False)
@@ -144,7 +145,7 @@ def bounces(assets, pictures):
     yield "| scene | points | direct | 1 | 2 | 3 | 4 | 5 | `auto` takes | left |\n|---|---:|---:|---:|---:|---:|---:|---:|---:|---:|"
     paths = [ROOT / "scenes" / f"{name}.xml" for name in SCENES] + [assets / "scenes" / name / "scene.xml" for name in INTERIORS]
     for path in paths:
-        asset = mi_prt.precompute(path, directions="cubemap:16", coefficients=16)
+        asset = mi_prt.precompute.precompute(path, directions="cubemap:16", coefficients=16)
         energy = [f"{x:.2g}" for x in asset.report["bounce_energy"][:6]] + [""] * 6
         name = path.stem if path.stem != "scene" else path.parent.name
         left = asset.report.get("bounce_energy_left") or 0.0
@@ -166,7 +167,7 @@ def furnace(assets, pictures):
         content["bunny"]["filename"] = str(assets / "meshes" / f"{name}.ply")
         for part in ("bunny", "plane"):
             content[part]["bsdf"] = white
-        asset = mi_prt.precompute(content, directions="cubemap:16", basis="sh", coefficients=1, paths_per_point=64, edge_length=0.2)
+        asset = mi_prt.precompute.precompute(content, directions="cubemap:16", basis="sh", coefficients=1, paths_per_point=64, edge_length=0.2)
         radiance = asset.relight(mi_prt.EnvironmentMap(np.ones((2, 4, 3), np.float32)))[~asset.buried]
         direct = asset.report["bounce_energy"][0]
         off = asset.points.report["dipping_hemispheres"]

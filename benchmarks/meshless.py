@@ -22,22 +22,23 @@ from page import plt, saved, write_page
 from scipy.spatial import cKDTree
 
 import mi_prt
-from mi_prt import meshless as meshless_run
+from mi_prt.precompute import meshless as meshless_run
 from mi_prt.basis.clustered import leading_components
-from mi_prt.evaluate import ground_truth, metrics
+from mi_prt.evaluate import ground_truth
+from mi_prt.evaluate import metrics
 from mi_prt.evaluate.ground_truth import Reference
 from mi_prt.lighting.emission import emission_of
 from mi_prt.lighting.light import as_light
 from mi_prt.lighting.scene_light import lit_scene
-from mi_prt.meshless_file import compressed
+from mi_prt.asset.meshless_file import compressed
 from mi_prt.points.particles import cross_surfaces, free_places, trace_particles
 from mi_prt.points.points import sample_points
 from mi_prt.points.samples import COVERED
 from mi_prt.points.thinning import embedded
-from mi_prt.precompute import measure
-from mi_prt.runtime import count_kernels, mitsuba
+from mi_prt.precompute.precompute import measure
+from mi_prt.system.runtime import count_kernels, mitsuba
 from mi_prt.scene.scene import mesh_arrays, open_scene
-from mi_prt.settings import MeshlessSettings
+from mi_prt.precompute.settings import MeshlessSettings
 from mi_prt.transport import local_direct
 from mi_prt.transport.depth import GRAZING, NEAREST
 from mi_prt.transport.hemispheres import HemisphereTracer, cluster_frames
@@ -227,7 +228,7 @@ def extremes(assets, pictures):
         "\nA room of 2 m divided by a wall of 1 cm, albedo 0.7: light on one side, flux on the other, where there should be none.\n\n"
         "| distance from the wall, m | direct flux in its own half | leak, direct | leak, indirect |\n|---:|---:|---:|---:|"
     )
-    room = mi_prt.precompute(_divided_room(), points="samples", **effort.settings)
+    room = mi_prt.precompute.precompute(_divided_room(), points="samples", **effort.settings)
     beyond = room.points.positions[:, 0] < 0
     for distance in (0.5, 0.1, 0.01, 1e-3, 0.0):
         light = mi_prt.PointLight((0.005 + distance, 0.1, 0.2), 1.0)
@@ -747,7 +748,7 @@ def _furnace():
         room = {"type": "cube", "flip_normals": True, "to_world": mi.ScalarTransform4f().scale([1.5, 1, 0.5]), "bsdf": _diffuse(albedo)}
         box = {"type": "cube", "to_world": mi.ScalarTransform4f().translate([0.5, -0.8, 0]).scale(0.2), "bsdf": _diffuse(albedo)}
         round_room, square_room = (
-            mi_prt.precompute(content, points="samples", **effort.furnace) for content in (sphere, {"type": "scene", "viewer": viewer, "room": room, "box": box})
+            mi_prt.precompute.precompute(content, points="samples", **effort.furnace) for content in (sphere, {"type": "scene", "viewer": viewer, "room": room, "box": box})
         )
         cells = []
         for place in ((0, 0, 0), (0.9, 0, 0)):

@@ -15,7 +15,7 @@ import mi_prt
 from mi_prt.directions import parse_directions
 from mi_prt.lighting.scene_light import scene_light
 from mi_prt.points.points import sample_points
-from mi_prt.runtime import count_kernels, thread_count
+from mi_prt.system.runtime import count_kernels, thread_count
 from mi_prt.scene.scene import open_scene
 from mi_prt.transport import direct
 
@@ -70,7 +70,7 @@ def kernels(scene, points, directions):
 def relighting(path, repeat):
     """Relighting alone, and turning + projecting + relighting; of direct light, and of light that reflections colour."""
     for bounces, bound in ((0, "≤ 2"), ("auto", "")):
-        asset = mi_prt.precompute(path, coefficients=48, bounces=bounces)
+        asset = mi_prt.precompute.precompute(path, coefficients=48, bounces=bounces)
         what = "direct light" if bounces == 0 else "with coloured reflections"
         light = asset.project_light(scene_light(open_scene(path)))
         relit = [_timed(lambda: asset.outgoing_radiance(asset.irradiance_from(*light))) for _ in range(20 * repeat)]

@@ -16,7 +16,7 @@ import numpy as np
 from mi_prt.evaluate import metrics
 from mi_prt.evaluate.ground_truth import irradiance
 from mi_prt.lighting.scene_light import lit_scene, scene_light
-from mi_prt.precompute import measure
+from mi_prt.precompute.precompute import measure
 from mi_prt.scene.scene import open_scene
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -12,7 +12,7 @@ scene = Path(sys.argv[1] if len(sys.argv) > 1 else Path(__file__).parent.parent 
 folder = Path(sys.argv[2] if len(sys.argv) > 2 else "out/compare_ground_truth")
 
 for coefficients in (16, 48, 128):
-    asset = mi_prt.precompute(scene, coefficients=coefficients)
+    asset = mi_prt.precompute.precompute(scene, coefficients=coefficients)
     report = mi_prt.compare(asset, folder / f"{coefficients}", size=(320, 240), spp=128)
     points, image = report["points"], report["image"]
     print(

@@ -11,8 +11,8 @@ from PIL import Image
 
 import mi_prt
 from mi_prt.lighting.scene_light import lit_scene, scene_light
-from mi_prt.relight_local import animate_local
-from mi_prt.render.animation import light_path
+from mi_prt.output.relight_local import animate_local
+from mi_prt.output.film import light_path
 from mi_prt.render.display import display, exposure
 from mi_prt.render.image import render_image, resized
 from mi_prt.scene.scene import open_scene
@@ -33,7 +33,7 @@ def main():
     started = time.perf_counter()
 
     say(f"1. precompute the transport of {SCENE.name} (once)")
-    asset = mi_prt.precompute(SCENE, coefficients=128, rays_per_direction=4)
+    asset = mi_prt.precompute.precompute(SCENE, coefficients=128, rays_per_direction=4)
     asset.save(arguments.out / "still_life.prt")
     say(
         f"   {len(asset.points):,} points, {asset.report['rays']:,} rays, {asset.report['bounces']} reflections, "
@@ -93,7 +93,7 @@ def turning_sky(asset, path, frames):
 def carried_lamp(path, frames):
     """Write an animation of a point light on its way from one room to the other, direct and reflected light."""
     begun = time.perf_counter()
-    asset = mi_prt.precompute(ROOM, points="samples", count=12_000, cluster_size=300, depth_directions=1024)
+    asset = mi_prt.precompute.precompute(ROOM, points="samples", count=12_000, cluster_size=300, depth_directions=1024)
     say(f"   {len(asset.points):,} samples, {len(asset.samples.roots)} clusters, {time.perf_counter() - begun:.1f} s")
     way = light_path(WALK)
     lamp = mi_prt.PointLight(way.positions(1)[0], (3.2, 2.9, 2.5))

@@ -8,8 +8,8 @@ import time
 from pathlib import Path
 
 import mi_prt
-from mi_prt.relight_local import animate_local
-from mi_prt.render.animation import light_path
+from mi_prt.output.relight_local import animate_local
+from mi_prt.output.film import light_path
 
 SCENE = Path(__file__).resolve().parent.parent / "scenes" / "room.xml"
 WALK = light_path("1.6,1.7,1.6 -0.6,1.7,1.5 0.1,1.6,0.2 0.1,1.6,-1.4 -1.6,1.7,-1.8 1.4,1.7,-2.0")  # through the doorway
@@ -26,7 +26,7 @@ def main():
     arguments.out.mkdir(parents=True, exist_ok=True)
 
     started = time.perf_counter()
-    asset = mi_prt.precompute(SCENE, points="samples", count=arguments.count, cluster_size=max(1, arguments.count // 45))
+    asset = mi_prt.precompute.precompute(SCENE, points="samples", count=arguments.count, cluster_size=max(1, arguments.count // 45))
     asset.save(arguments.out / "room.prt")
     print(f"{len(asset.points):,} samples in {len(asset.samples.roots)} clusters: {time.perf_counter() - started:.0f} s")
 

@@ -9,7 +9,7 @@ scene = {
     "floor": {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.4, 0.5, 0.6]}}},
     "ball": {"type": "sphere", "center": [0, 0, 0.4], "radius": 0.3},
 }
-asset = mi_prt.precompute(scene, directions="cubemap:16", coefficients=32)
+asset = mi_prt.precompute.precompute(scene, directions="cubemap:16", coefficients=32)
 print(
     f"{len(asset.points):,} points, {asset.directions}, captured variance {asset.report['captured_variance']:.3f}, "
     f"{asset.report['bounces']} reflections: mean irradiance under a white sky {sum(asset.report['bounce_energy']):.3f} of π"

@@ -9,11 +9,11 @@
 Importing this package chooses the LLVM that Dr.Jit will load and registers the integrator plugin `prt` with Mitsuba.
 """
 
-from .llvm import select_llvm
+from .system.llvm import select_llvm
 
 select_llvm()  # before anything can load Dr.Jit: an LLVM that is too old would end the process
 
-from .asset import Asset  # noqa: E402
+from .asset.asset import Asset  # noqa: E402
 from .errors import (  # noqa: E402
     AssetError,
     InputError,
@@ -27,10 +27,10 @@ from .evaluate.compare import compare  # noqa: E402
 from .lighting.environment import EnvironmentMap, LightWarning  # noqa: E402
 from .lighting.light import DirectionalLight, Light  # noqa: E402
 from .lighting.local_lights import AreaLight, PointLight, SpotLight  # noqa: E402
-from .meshless_asset import MeshlessAsset  # noqa: E402
-from .opening import load  # noqa: E402
-from .precompute import precompute  # noqa: E402
-from .relight import relight_to_file  # noqa: E402
+from .asset.meshless_asset import MeshlessAsset  # noqa: E402
+from .asset.opening import load  # noqa: E402
+from .precompute.precompute import precompute  # noqa: E402
+from .output.relight import relight_to_file  # noqa: E402
 from .render.integrator import register_integrator  # noqa: E402
 
 __version__ = "0.4.0"

@@ -127,7 +127,7 @@ Quantize = Annotated[
 @app.command(epilog="Example: mi-prt doctor --json")
 def doctor(as_json: Json = False):
     """Check this machine: LLVM, Mitsuba, Embree, raster platform; with the remedy for each fault."""
-    from . import doctor as examination
+    from .system import doctor as examination
 
     checks = examination.examine()
     if as_json:
@@ -166,10 +166,10 @@ def info(
     as_json: Json = False,
 ):
     """Say what a scene requires and what precomputing it will cost, or what an asset holds."""
-    from . import info as description
+    from .precompute import info as description
 
     if path.is_file() and _is_hdf5(path):
-        from .opening import load
+        from .asset.opening import load
 
         found = description.describe_asset(load(path))
     else:
@@ -220,8 +220,8 @@ def precompute(
     What is computed on the way is kept in FILE.partial until FILE is whole: a run that is interrupted or killed can be
     continued with --resume, and gives the same file.
     """
-    from .files import check_writable
-    from .precompute import measure
+    from .system.files import check_writable
+    from .precompute.precompute import measure
 
     check_writable(output)
     _set_threads(threads)
@@ -274,8 +274,8 @@ def relight(
     as_json: Json = False,
 ):
     """Relight an asset: an image, a mesh with vertex radiance, plain arrays, or a film of a light that moves."""
-    from .opening import load
-    from .relight import relight_to_file
+    from .asset.opening import load
+    from .output.relight import relight_to_file
 
     _set_threads(threads)
     chosen = _light(envmap, light)
@@ -311,7 +311,7 @@ def compare(
     as_json: Json = False,
 ):
     """Compare an asset with Mitsuba's ground truth and write a report with pictures."""
-    from .opening import load
+    from .asset.opening import load
     from .evaluate.compare import compare as run
 
     _set_threads(threads)
@@ -339,7 +339,7 @@ def main(arguments=None):
     """Run the program; exit codes: 0 done, 2 bad usage or input, 130 interrupted, 1 anything else."""
     warnings.showwarning = lambda message, *_, **__: _note(str(message))
     try:
-        from .runtime import quiet_mitsuba
+        from .system.runtime import quiet_mitsuba
 
         if not _only_help(sys.argv[1:] if arguments is None else arguments):
             quiet_mitsuba()
@@ -353,9 +353,9 @@ def main(arguments=None):
 
 
 def _film(asset, output, places, light, rotate, frames, fps, scene, sensor, size, renderer, spp, component, direct):
-    from .meshless_asset import MeshlessAsset
-    from .relight_local import animate_local
-    from .render.animation import light_path
+    from .asset.meshless_asset import MeshlessAsset
+    from .output.relight_local import animate_local
+    from .output.film import light_path
 
     if not isinstance(asset, MeshlessAsset) or rotate is not None:
         raise SettingsError("--light-path moves a light inside the scene: it takes an asset of --points samples, and no --rotate")
@@ -395,8 +395,8 @@ def _count(option, text):
 
 def _settings(context, points):
     """The settings of a kind of points, from all options of a command; those of the other kind must not be given."""
-    from .precompute import POINTS
-    from .settings import names_of
+    from .precompute.precompute import POINTS
+    from .precompute.settings import names_of
 
     if points not in POINTS:
         raise SettingsError(f"--points {points} is not known: use {' or '.join(POINTS)}")
@@ -413,7 +413,7 @@ def _settings(context, points):
 
 def _summary(asset):
     """What `precompute` tells of an asset."""
-    from .meshless_asset import MeshlessAsset
+    from .asset.meshless_asset import MeshlessAsset
 
     names = ["bounces", "captured_variance", "relative_error"]
     if not isinstance(asset, MeshlessAsset):
@@ -446,7 +446,7 @@ def _size(text):
 
 def _set_threads(threads):
     if threads is not None:
-        from .runtime import set_threads
+        from .system.runtime import set_threads
 
         set_threads(threads)
 

@@ -7,7 +7,7 @@ import scipy.stats
 
 from mi_prt.directions import parse_directions
 from mi_prt.points.points import sample_points
-from mi_prt.runtime import mitsuba
+from mi_prt.system.runtime import mitsuba
 from mi_prt.scene.scene import open_scene
 from mi_prt.transport.direct import find_buried, sample_direct
 from mi_prt.transport.hops import NOTHING, Hops, HopSampler, blocked_share

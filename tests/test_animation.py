@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from mi_prt.errors import SettingsError
-from mi_prt.render.animation import LightPath, check_frames_output, light_path, write_frames
+from mi_prt.output.film import LightPath, check_frames_output, light_path, write_frames
 
 HEIGHT, WIDTH = 47, 65  # odd, which H.264 is not
 

@@ -12,7 +12,7 @@ from mi_prt import AssetError, SettingsError
 from mi_prt.basis.bases import BASES
 from mi_prt.directions import parse_directions
 from mi_prt.evaluate import ground_truth
-from mi_prt.info import describe, describe_asset
+from mi_prt.precompute.info import describe, describe_asset
 from mi_prt.lighting.cells import cell_radiance
 from mi_prt.lighting.lattice import on_lattice
 from mi_prt.lighting.scene_light import lit_scene
@@ -37,7 +37,7 @@ def sky():
 
 def precompute(parts=PARTS, directions="cubemap:16", edge_length=0.3, bounces=0, **settings):
     """Of direct light, unless bounces are asked for."""
-    return mi_prt.precompute(scene(**parts), directions=directions, edge_length=edge_length, bounces=bounces, **settings)
+    return mi_prt.precompute.precompute(scene(**parts), directions=directions, edge_length=edge_length, bounces=bounces, **settings)
 
 
 @pytest.fixture(scope="module")

@@ -15,15 +15,16 @@ import threadpoolctl
 import mi_prt
 import mi_prt.transport.direct
 from conftest import bias, cube, diffuse, disk, rectangle, relative_l2, scene, sphere, uniform_sky
-from mi_prt import AssetError, SettingsError, room
+from mi_prt.precompute import budget as room
+from mi_prt import AssetError, SettingsError
 from mi_prt.basis import pca
 from mi_prt.basis.pca import fit_pca
 from mi_prt.basis.rows import Rows
 from mi_prt.basis.target import Target
 from mi_prt.directions import Cubemap
 from mi_prt.lighting.cells import cell_radiance
-from mi_prt.precompute import measure
-from mi_prt.runtime import mitsuba
+from mi_prt.precompute.precompute import measure
+from mi_prt.system.runtime import mitsuba
 from mi_prt.scene.scene import open_scene
 from mi_prt.transport.direct import sample_direct
 
@@ -45,7 +46,7 @@ ASSETS = {
 
 def precompute(parts=SMALL, directions="cubemap:8", edge_length=0.8, bounces=0, **settings):
     """Of direct light, unless bounces are asked for."""
-    return mi_prt.precompute(scene(**parts), directions=directions, edge_length=edge_length, bounces=bounces, **settings)
+    return mi_prt.precompute.precompute(scene(**parts), directions=directions, edge_length=edge_length, bounces=bounces, **settings)
 
 
 @pytest.fixture(scope="module", params=ASSETS)
@@ -389,7 +390,7 @@ PROGRAM = """
 import sys, mi_prt
 red = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.8, 0.3, 0.2]}}
 parts = {"type": "scene", "ball": {"type": "sphere", "center": [0, 1, 0], "bsdf": red}, "box": {"type": "cube"}, "extra": {"type": "disk"}}
-asset = mi_prt.precompute(parts, directions="cubemap:8", edge_length=0.5, indirect=sys.argv[2], paths_per_point=64)
+asset = mi_prt.precompute.precompute(parts, directions="cubemap:8", edge_length=0.5, indirect=sys.argv[2], paths_per_point=64)
 assert asset.channels == 3
 asset.save(sys.argv[1])
 """

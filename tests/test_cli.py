@@ -40,7 +40,7 @@ def scene(tmp_path_factory):
 @pytest.fixture(scope="module")
 def asset(scene, tmp_path_factory):
     path = tmp_path_factory.mktemp("asset") / "box.prt"
-    mi_prt.precompute(scene, directions="cubemap:8", coefficients=16, edge_length=0.2).save(path)
+    mi_prt.precompute.precompute(scene, directions="cubemap:8", coefficients=16, edge_length=0.2).save(path)
     return path
 
 

@@ -26,7 +26,7 @@ from conftest import (
 from mi_prt.directions import Cubemap
 from mi_prt.lighting.cells import cell_radiance
 from mi_prt.lighting.scene_light import scene_light
-from mi_prt.runtime import mitsuba
+from mi_prt.system.runtime import mitsuba
 from mi_prt.scene.scene import open_scene
 from mi_prt.transport.direct import sample_direct
 
@@ -36,7 +36,7 @@ CELL_RADIUS = np.pi / 4 / 8 * (8 / 3) ** 0.5  # no direction is farther than thi
 
 
 def precompute(parts, directions="cubemap:32", **settings):
-    return mi_prt.precompute(parts, directions=directions, **settings)
+    return mi_prt.precompute.precompute(parts, directions=directions, **settings)
 
 
 def under_own_light(parts, **settings):

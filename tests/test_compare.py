@@ -7,7 +7,7 @@ from conftest import cube, rectangle, scene
 
 import mi_prt
 from mi_prt.evaluate import metrics
-from mi_prt.runtime import mitsuba
+from mi_prt.system.runtime import mitsuba
 
 mi = mitsuba()
 
@@ -35,7 +35,7 @@ def read(path):
 
 @pytest.fixture(scope="module")
 def room():
-    return mi_prt.precompute(lit_room(), directions="cubemap:16", edge_length=0.2)
+    return mi_prt.precompute.precompute(lit_room(), directions="cubemap:16", edge_length=0.2)
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +66,7 @@ def test_the_reference_has_the_reflections_that_were_asked_for(whole, tmp_path, 
     """Then the result is right, by the tolerances of above, and the report says what both sides have. Of the picture's light the
     reflections are 3.6 %, and those after the first 0.5 %; five renders with other seeds differ by 0.06 %."""
     settings = dict(directions="cubemap:16", edge_length=0.2, bounces=bounces, indirect=indirect, paths_per_point=256)
-    report = mi_prt.compare(mi_prt.precompute(lit_room(), **settings), tmp_path, scene=lit_room(), spp=64)
+    report = mi_prt.compare(mi_prt.precompute.precompute(lit_room(), **settings), tmp_path, scene=lit_room(), spp=64)
     assert (report["bounces"], report["reference_bounces"], report["bounce_energy_left"]) == (bounces, bounces, 0)
     most, folder = whole
     assert most["bounces"] > 1 and most["reference_bounces"] == "any number" and 0 < most["bounce_energy_left"] < 1e-3

@@ -12,7 +12,7 @@ from conftest import diffuse, emitted, random_rotation, rectangle, relative_l2, 
 from mi_prt import EnvironmentMap, SettingsError
 from mi_prt.directions import Cubemap, Halton, LatLong, parse_directions
 from mi_prt.lighting.cells import cell_radiance
-from mi_prt.runtime import mitsuba
+from mi_prt.system.runtime import mitsuba
 
 LATTICES = [
     Cubemap(1),
@@ -532,6 +532,6 @@ def test_energy_of_light_on_any_lattice(lattice):
 def test_irradiance_of_an_open_plane(directions, rays):
     """Nothing but a plane that faces a tilted direction: E = π under a sky of 1, to 1 % from these coarse lattices."""
     plane = rectangle(normal=(0.3, 0.8, -0.4), bsdf=diffuse())
-    asset = mi_prt.precompute(scene(p=plane), directions=directions, coefficients=0, rays_per_direction=rays)
+    asset = mi_prt.precompute.precompute(scene(p=plane), directions=directions, coefficients=0, rays_per_direction=rays)
     irradiance = asset.irradiance(np.ones((2, 4, 3), np.float32))
     np.testing.assert_allclose(irradiance, np.pi, rtol=0.01)

@@ -27,7 +27,7 @@ from mi_prt.lighting.cells import cell_radiance
 from mi_prt.lighting.environment import rotation_matrix
 from mi_prt.lighting.light import as_light
 from mi_prt.lighting.scene_light import lit_scene, scene_light
-from mi_prt.runtime import mitsuba
+from mi_prt.system.runtime import mitsuba
 from mi_prt.scene.scene import open_scene
 
 mi = mitsuba()
@@ -315,7 +315,7 @@ def test_prepared_light_turns_like_the_map():
 
     A direction moves by at most the radius of a fine cell, a third of a coarse one's, so that a smooth sky hardly changes.
     """
-    asset = mi_prt.precompute(scene(ball=sphere()), directions="cubemap:16", edge_length=1.0)
+    asset = mi_prt.precompute.precompute(scene(ball=sphere()), directions="cubemap:16", edge_length=1.0)
     pixels = sky_of(lambda d: np.exp(2 * d @ np.array([[0.5, 1, 0], [0.5, 0, 1], [0.7, 0, 0.1]])), 64)
     sun = DirectionalLight([0, -1, 0.2], [1, 1, 1])
     exact = Light((EnvironmentMap(pixels),), (sun,))

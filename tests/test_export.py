@@ -10,9 +10,9 @@ from PIL import Image
 
 from mi_prt.errors import SettingsError
 from mi_prt.points.points import sample_points
-from mi_prt.render import export
+from mi_prt.output import export
 from mi_prt.render.display import display, exposure
-from mi_prt.runtime import mitsuba
+from mi_prt.system.runtime import mitsuba
 from mi_prt.scene.scene import open_scene
 
 

@@ -10,7 +10,7 @@ import mi_prt
 from conftest import bias, cube, diffuse, disk, facing, rectangle, relative_l2, sphere, uniform_sky
 from mi_prt import AssetError, LightError, SceneError
 from mi_prt.render.integrator import integrator_for
-from mi_prt.runtime import mitsuba
+from mi_prt.system.runtime import mitsuba
 
 mi = mitsuba()
 
@@ -54,7 +54,7 @@ def by_mitsuba(mi_scene, spp=512, bounces=0, **rest):
 
 def precompute(parts, directions="cubemap:16", bounces=0, **settings):
     """Of direct light, unless bounces are asked for."""
-    return mi_prt.precompute(parts, directions=directions, bounces=bounces, **settings)
+    return mi_prt.precompute.precompute(parts, directions=directions, bounces=bounces, **settings)
 
 
 @pytest.fixture(scope="module")

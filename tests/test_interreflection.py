@@ -150,7 +150,7 @@ def test_asset_of_a_white_furnace(denoise):
     parts = scene(**walls(diffuse(1.0)))
     scene_ = sampled(parts, 1.0)
     components = len(scene_.points) - 1
-    asset = mi_prt.precompute(
+    asset = mi_prt.precompute.precompute(
         parts, directions="cubemap:16", edge_length=1.0, coefficients=components, paths_per_point=32, denoise=denoise
     )
     bound = quadrature_error(scene_) + ROUNDING
@@ -177,7 +177,7 @@ def test_what_reflects_nothing_to_any_point_is_direct_light_bit_for_bit(name, tm
     for indirect, bounces in (("solve", 0), ("solve", 3), ("solve", "auto"), ("paths", 3), ("paths", "auto")):
         path = files[indirect, bounces] = tmp_path / f"{indirect}-{bounces}.prt"
         settings = dict(bounces=bounces, indirect=indirect, paths_per_point=64)
-        asset = mi_prt.precompute(NOTHING_REFLECTED[name](), directions="cubemap:8", edge_length=0.5, output=path, **settings)
+        asset = mi_prt.precompute.precompute(NOTHING_REFLECTED[name](), directions="cubemap:8", edge_length=0.5, output=path, **settings)
         assert asset.report["bounces"] == 0 and asset.channels == 1 and len(asset.report["bounce_energy"]) == 1
     expected = arrays(files.pop(("solve", 0)))
     for path in files.values():
@@ -445,7 +445,7 @@ def test_both_ways_find_the_same_energy_after_each_reflection(coloured_room):
 def test_no_light_leaks_into_a_closed_box(indirect):
     """Six two-sided squares edge to edge: inside it is dark after any number of reflections, outside nothing is reflected."""
     parts = scene(**walls(two_sided(diffuse(0.9)), TOWARD))
-    asset = mi_prt.precompute(parts, directions="cubemap:16", edge_length=0.4, indirect=indirect, paths_per_point=128)
+    asset = mi_prt.precompute.precompute(parts, directions="cubemap:16", edge_length=0.4, indirect=indirect, paths_per_point=128)
     outward = np.sum(asset.points.positions * asset.points.normals, axis=1) > 0
     assert 0.4 < outward.mean() < 0.6 and not asset.buried.any()
     irradiance = asset.irradiance(uniform_sky())

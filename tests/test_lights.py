@@ -34,7 +34,7 @@ from mi_prt.lighting.local import arrival, hull_warning
 from mi_prt.lighting.parse import parse_light, parse_rotation
 from mi_prt.lighting.scene_light import lit_scene, summed_maps
 from mi_prt.points.points import sample_points
-from mi_prt.runtime import mitsuba
+from mi_prt.system.runtime import mitsuba
 from mi_prt.scene.scene import open_scene
 
 mi = mitsuba()
@@ -74,7 +74,7 @@ def unoccluded(points, lights):
 
 def precompute(content, directions="cubemap:16", **settings):
     """Without compression, so that only the lattice is between the asset and the truth."""
-    return mi_prt.precompute(content, directions=directions, **{"basis": "none", "edge_length": 0.25} | settings)
+    return mi_prt.precompute.precompute(content, directions=directions, **{"basis": "none", "edge_length": 0.25} | settings)
 
 
 @pytest.fixture(scope="module")
@@ -599,7 +599,7 @@ def files(tmp_path_factory):
         <film type='hdrfilm'><integer name='width' value='24'/><integer name='height' value='16'/></film></sensor>
         <emitter type='constant'/></scene>"""
     )
-    mi_prt.precompute(folder / "walled.xml", directions="cubemap:8", coefficients=16, edge_length=0.4).save(folder / "a.prt")
+    mi_prt.precompute.precompute(folder / "walled.xml", directions="cubemap:8", coefficients=16, edge_length=0.4).save(folder / "a.prt")
     OpenEXR.File({}, {"RGB": np.ones((4, 8, 3), np.float32)}).write(str(folder / "sky.exr"))
     return folder
 

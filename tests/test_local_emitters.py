@@ -18,7 +18,7 @@ from mi_prt.lighting.parse import parse_light
 from mi_prt.lighting.scene_light import chosen_local_light, lit_scene
 from mi_prt.directions import parse_directions
 from mi_prt.points.points import sample_points
-from mi_prt.runtime import mitsuba
+from mi_prt.system.runtime import mitsuba
 from mi_prt.scene.scene import open_scene
 
 mi = mitsuba()
@@ -443,7 +443,7 @@ OTHERS = [SpotLight([0, 3, 0], [0, -1, 0], 1), LAMP, flat_emission([[0, 3, 0]], 
 @pytest.mark.parametrize("light", OTHERS, ids=lambda light: type(light).__name__)
 def test_transport_of_distant_light_takes_point_lights_only(light, tmp_path):
     parts = scene(floor=rectangle())
-    asset = mi_prt.precompute(parts, directions="cubemap:4", basis="none", edge_length=1.0)
+    asset = mi_prt.precompute.precompute(parts, directions="cubemap:4", basis="none", edge_length=1.0)
     mixed = [PointLight([0, 3, 0], 1), uniform_sky(), light]
     for refused in (
         lambda: asset.irradiance(light),

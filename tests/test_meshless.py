@@ -21,7 +21,7 @@ from mi_prt.lighting.light import as_light
 from mi_prt.lighting.scene_light import lit_scene
 from mi_prt.points.points import POINT_FIELDS
 from mi_prt.points.samples import scatter_samples
-from mi_prt.runtime import count_kernels, mitsuba
+from mi_prt.system.runtime import count_kernels, mitsuba
 from mi_prt.scene.scene import open_scene
 from mi_prt.transport.depth import GRAZING, NEAREST, DepthBuffers, compress, log_depth
 from mi_prt.transport.examples import RAISE, trace_examples
@@ -38,7 +38,7 @@ SMALL = dict(
 
 
 def precompute(parts, **settings):
-    return mi_prt.precompute(parts, points="samples", **(SMALL | settings))
+    return mi_prt.precompute.precompute(parts, points="samples", **(SMALL | settings))
 
 
 def eye(origin, target=(0, 0, 0)):

@@ -16,12 +16,12 @@ from conftest import cube, diffuse, rectangle, scene, uniform_sky
 import mi_prt
 from mi_prt import AssetError, DirectionalLight, LightError, MeshlessAsset, PointLight, SettingsError
 from mi_prt.lighting.local_emitters import local_scene_light
-from mi_prt.meshless_file import as_stored, compressed
+from mi_prt.asset.meshless_file import as_stored, compressed
 from mi_prt.points.points import POINT_FIELDS
-from mi_prt.quantize import LARGEST, cluster_scales, quantized, quantized_by_cluster
-from mi_prt.runtime import mitsuba
+from mi_prt.asset.quantize import LARGEST, cluster_scales, quantized, quantized_by_cluster
+from mi_prt.system.runtime import mitsuba
 from mi_prt.scene.scene import open_scene
-from mi_prt.settings import MeshlessSettings
+from mi_prt.precompute.settings import MeshlessSettings
 
 mi = mitsuba()
 
@@ -47,7 +47,7 @@ LIGHT = PointLight((0.3, 0.2, 0.4), (1.0, 2.0, 3.0))
 
 
 def precompute(parts=SCENE, **settings):
-    return mi_prt.precompute(parts, points="samples", **(SETTINGS | settings))
+    return mi_prt.precompute.precompute(parts, points="samples", **(SETTINGS | settings))
 
 
 @pytest.fixture(scope="module")
@@ -334,7 +334,7 @@ def test_foreign_files(tmp_path):
 def test_both_kinds_of_files(files, tmp_path):
     """Distant light has format version 3, as before there were others, and local light 4; `load` tells them apart. A file that says it is of the
     other kind, or of a version yet to come, is refused."""
-    distant = mi_prt.precompute(SCENE, directions="cubemap:4", edge_length=0.5, coefficients=4, bounces=0)
+    distant = mi_prt.precompute.precompute(SCENE, directions="cubemap:4", edge_length=0.5, coefficients=4, bounces=0)
     distant.save(tmp_path / "distant.prt")
     loaded = mi_prt.load(tmp_path / "distant.prt")
     assert isinstance(loaded, mi_prt.Asset) and isinstance(mi_prt.load(files["16 dense"]), MeshlessAsset)
@@ -414,7 +414,7 @@ def test_bad_settings(bad):
     """Each is refused by its name, in one line, before any work: precompute does not look at the scene, which there is none."""
     name = next(iter(bad))
     with pytest.raises(SettingsError) as caught:
-        mi_prt.precompute("no such scene.xml", points="samples", **bad)
+        mi_prt.precompute.precompute("no such scene.xml", points="samples", **bad)
     assert name.split("_")[0] in str(caught.value) and "\n" not in str(caught.value)
 
 
@@ -430,13 +430,13 @@ def test_settings_are_stored_as_plain_numbers():
 def test_settings_of_the_other_kind_of_points(points, setting):
     """Refused by name, with those that there are."""
     with pytest.raises(SettingsError, match=f"{setting} is no setting of points '{points}'"):
-        mi_prt.precompute(SCENE, points=points, **{setting: 1})
+        mi_prt.precompute.precompute(SCENE, points=points, **{setting: 1})
 
 
 @pytest.mark.parametrize("points", ["meshless", "", None, "Samples"])
 def test_points_that_are_not_known(points):
     with pytest.raises(SettingsError, match="use vertices or samples"):
-        mi_prt.precompute(SCENE, points=points)
+        mi_prt.precompute.precompute(SCENE, points=points)
 
 
 def test_fewer_samples_than_anything_else(tmp_path):

@@ -25,7 +25,7 @@ from conftest import (
 from mi_prt import SceneError, SettingsError
 from mi_prt.points.locate import PatchLocator
 from mi_prt.points.points import sample_points
-from mi_prt.runtime import mitsuba
+from mi_prt.system.runtime import mitsuba
 from mi_prt.scene.scene import Scene, SceneSource, open_scene
 
 mi = mitsuba()
@@ -329,7 +329,7 @@ def test_bad_edge_lengths(length):
 def test_back_points_see_the_other_half():
     """A two-sided plane has its points twice, with opposite normals: each side is lit by its own half of the sky."""
     both = {"type": "twosided", "front": diffuse([0.1, 0.2, 0.3]), "back": diffuse([0.9, 0.8, 0.7])}
-    asset = mi_prt.precompute(scene(a=rectangle(bsdf=both)), directions="cubemap:16", edge_length=1.0)
+    asset = mi_prt.precompute.precompute(scene(a=rectangle(bsdf=both)), directions="cubemap:16", edge_length=1.0)
     points, half = asset.points, len(asset.points) // 2
     assert points.report["back_points"] == half
     np.testing.assert_array_equal(points.positions[:half], points.positions[half:])
@@ -356,7 +356,7 @@ def test_two_sided_surfaces_that_are_inside_out(shape):
     else:
         corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], float)
         body = mesh(corners, [[0, 2, 1], [0, 3, 1], [0, 3, 2], [1, 2, 3]], bsdf=TWO_SIDED)  # the second looks inwards
-    asset = mi_prt.precompute(scene(a=body), directions="cubemap:16", edge_length=0.7)
+    asset = mi_prt.precompute.precompute(scene(a=body), directions="cubemap:16", edge_length=0.7)
     at = locate(open_scene(scene(a=body)), asset.points)
     from_outside = at["outside"]
     assert from_outside.sum() > 500 and at["found"][from_outside].all()
@@ -382,8 +382,8 @@ def irregular(tmp_path, kind):
 
 def test_degenerate_faces_are_counted_and_harmless(tmp_path):
     """They have no area and no points; everything else is as without them."""
-    asset = mi_prt.precompute(scene(a=irregular(tmp_path, "degenerate")), directions="cubemap:16", edge_length=0.5)
-    plain = mi_prt.precompute(scene(a=irregular(tmp_path, "plain")), directions="cubemap:16", edge_length=0.5)
+    asset = mi_prt.precompute.precompute(scene(a=irregular(tmp_path, "degenerate")), directions="cubemap:16", edge_length=0.5)
+    plain = mi_prt.precompute.precompute(scene(a=irregular(tmp_path, "plain")), directions="cubemap:16", edge_length=0.5)
     assert asset.points.report["degenerate_faces"] == 4
     assert len(asset.points) == len(plain.points)
     assert asset.points.areas.sum() == pytest.approx(1)
@@ -394,7 +394,7 @@ def test_degenerate_faces_are_counted_and_harmless(tmp_path):
 
 def test_zero_normals_are_replaced_by_the_faces(tmp_path):
     """At a vertex whose normal is zero the faces around it tell; the plane stays lit as a plane."""
-    asset = mi_prt.precompute(scene(a=irregular(tmp_path, "zero normals")), directions="cubemap:16", edge_length=0.5)
+    asset = mi_prt.precompute.precompute(scene(a=irregular(tmp_path, "zero normals")), directions="cubemap:16", edge_length=0.5)
     assert asset.points.report["zero_normals"] >= 1
     np.testing.assert_allclose(asset.points.normals, np.broadcast_to([0, 0, 1], asset.points.normals.shape), atol=1e-6)
     np.testing.assert_allclose(asset.irradiance(uniform_sky()), np.pi, rtol=2e-3)
@@ -402,7 +402,7 @@ def test_zero_normals_are_replaced_by_the_faces(tmp_path):
 
 def test_normals_against_the_faces_are_counted_and_lead(tmp_path):
     """Mitsuba shades by the shading normal: the side that it points to is lit, by the lower sky here."""
-    asset = mi_prt.precompute(scene(a=irregular(tmp_path, "flipped normals")), directions="cubemap:16", edge_length=0.5)
+    asset = mi_prt.precompute.precompute(scene(a=irregular(tmp_path, "flipped normals")), directions="cubemap:16", edge_length=0.5)
     assert asset.points.report["flipped_normals"] == len(asset.points)
     np.testing.assert_allclose(asset.points.normals[:, 2], -1, atol=1e-6)
     np.testing.assert_allclose(asset.irradiance(uniform_sky()), np.pi, rtol=2e-3)
@@ -413,7 +413,7 @@ def test_positions_that_are_not_finite_are_refused(bad):
     positions, faces, normals = bumpy()
     positions[5] = bad
     with pytest.raises(SceneError) as caught:
-        mi_prt.precompute(scene(a=mesh(positions, faces, normals)), directions="cubemap:4")
+        mi_prt.precompute.precompute(scene(a=mesh(positions, faces, normals)), directions="cubemap:4")
     assert "\n" not in str(caught.value)
 
 
@@ -487,7 +487,7 @@ def test_floor_under_a_box_is_buried_and_nothing_else():
     parts = dict(
         floor=rectangle(size=2), box={"type": "cube", "to_world": transform().translate([0.13, 0.5, 0.21]).scale(0.5)}
     )
-    asset = mi_prt.precompute(scene(**parts), directions="cubemap:16", edge_length=0.3)
+    asset = mi_prt.precompute.precompute(scene(**parts), directions="cubemap:16", edge_length=0.3)
     points = asset.points
     inside = (np.abs(points.positions[:, [0, 2]] - [0.13, 0.21]) < 0.5 - 1e-4).all(axis=1)
     floor = points.surface == 0
@@ -498,7 +498,7 @@ def test_floor_under_a_box_is_buried_and_nothing_else():
 
 def test_points_inside_a_closed_body_are_buried():
     """A foot below ground: the part of a ball under a closed box's surface sees nothing but backs of faces."""
-    asset = mi_prt.precompute(scene(box=cube(size=1), ball=sphere((0, 1, 0), 0.5)), directions="cubemap:16", edge_length=0.5)
+    asset = mi_prt.precompute.precompute(scene(box=cube(size=1), ball=sphere((0, 1, 0), 0.5)), directions="cubemap:16", edge_length=0.5)
     ball = asset.points.surface == 1
     below = asset.points.positions[:, 1] < 1 - 1e-3
     np.testing.assert_array_equal(asset.buried[ball & below], True)
@@ -513,7 +513,7 @@ def test_a_scene_in_which_every_point_is_buried(indirect):
     a, b, c = np.moveaxis(corners[faces], 1, 0)
     outward = (np.cross(b - a, c - a) * a).sum(axis=1) > 0
     ball = mesh(corners, np.where(outward[:, None], faces, faces[:, ::-1]), -corners)
-    asset = mi_prt.precompute(scene(a=ball), directions="cubemap:4", edge_length=5, indirect=indirect)
+    asset = mi_prt.precompute.precompute(scene(a=ball), directions="cubemap:4", edge_length=5, indirect=indirect)
     assert asset.buried.all() and asset.report["bounces"] == 0 and not asset.irradiance(uniform_sky()).any()
 
 
@@ -528,7 +528,7 @@ def room(walls=6, rotation=np.eye(3), **rest):
 
 def test_a_dark_room_is_not_buried():
     """A closed room sees no sky, but its points see its walls from the front, far away: dark, not buried."""
-    asset = mi_prt.precompute(scene(**room()), directions="cubemap:8", edge_length=0.5)
+    asset = mi_prt.precompute.precompute(scene(**room()), directions="cubemap:8", edge_length=0.5)
     interior = np.sort(np.abs(asset.points.positions), axis=1)[:, 1] < 1 - 1e-3  # not on an edge
     assert not asset.buried[interior].any()
 
@@ -540,7 +540,7 @@ def test_no_light_leaks_into_a_closed_room(seed, two_sided, indirect):
     """No point inside sees the sky, also not one on an edge, which lies in the plane of the adjoining wall; nor what reflects it."""
     rotation = np.eye(3) if seed is None else random_rotation(np.random.default_rng(seed))
     parts = scene(**room(rotation=rotation, **({"bsdf": TWO_SIDED} if two_sided else {})))
-    asset = mi_prt.precompute(parts, directions="cubemap:8", edge_length=0.5, indirect=indirect, paths_per_point=64)
+    asset = mi_prt.precompute.precompute(parts, directions="cubemap:8", edge_length=0.5, indirect=indirect, paths_per_point=64)
     inside = (asset.points.positions * asset.points.normals).sum(axis=1) < 0
     assert inside.sum() > 100
     assert asset.irradiance(uniform_sky())[inside].max() < 0.01
@@ -555,7 +555,7 @@ def test_light_along_the_edges_of_an_open_room(seed):
     """
     rotation = np.eye(3) if seed is None else random_rotation(np.random.default_rng(seed))
     parts = scene(**room(5, rotation))
-    asset = mi_prt.precompute(parts, directions="cubemap:16", edge_length=0.7, rays_per_direction=4, bounces=0)
+    asset = mi_prt.precompute.precompute(parts, directions="cubemap:16", edge_length=0.7, rays_per_direction=4, bounces=0)
     local = asset.points.positions.astype(float) @ rotation
     on_edge = np.flatnonzero(((np.abs(local) > 1 - 1e-4).sum(axis=1) >= 2) & (local[:, 1] < 0.9))
     assert len(on_edge) > 20

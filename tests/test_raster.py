@@ -21,7 +21,7 @@ from mi_prt.points.points import sample_points
 from mi_prt.render.display import display, exposure
 from mi_prt.render.image import render_image, resized
 from mi_prt.render.raster import RasterScene, render_raster
-from mi_prt.runtime import mitsuba
+from mi_prt.system.runtime import mitsuba
 from mi_prt.scene.scene import open_scene
 
 SCENES = Path(__file__).resolve().parents[1] / "scenes"
@@ -98,7 +98,7 @@ def test_agrees_with_the_integrator(name, mean, high):
     have no sign, so the bias stays small. Measured: mean 0.0021 and 0.00014, 99th percentile 0.028 and 0.0015.
     """
     opened = open_scene(SCENES / f"{name}.xml")
-    asset = mi_prt.precompute(opened, directions="cubemap:16", coefficients=32, bounces=0)  # any irradiance will do
+    asset = mi_prt.precompute.precompute(opened, directions="cubemap:16", coefficients=32, bounces=0)  # any irradiance will do
     irradiance = asset.irradiance(scene_light(opened))
     factor = exposure(asset.outgoing_radiance(irradiance))
     with resized(opened.mi_scene.sensors()[0], (320, 240)) as sensor:

@@ -19,7 +19,7 @@ from conftest import (
     sphere,
 )
 
-from mi_prt.runtime import count_kernels, mitsuba
+from mi_prt.system.runtime import count_kernels, mitsuba
 from mi_prt.transport.interreflection import combined
 
 mi = mitsuba()

@@ -12,11 +12,11 @@ from mi_prt import LightError, SettingsError
 from mi_prt.cli import main
 from mi_prt.evaluate import ground_truth
 from mi_prt.lighting.scene_light import lit_scene
-from mi_prt.relight import relight_to_file
-from mi_prt.relight_local import animate_local
-from mi_prt.render.animation import light_path
-from mi_prt.render.export import to_8bit
-from mi_prt.runtime import mitsuba
+from mi_prt.output.relight import relight_to_file
+from mi_prt.output.relight_local import animate_local
+from mi_prt.output.film import light_path
+from mi_prt.output.export import to_8bit
+from mi_prt.system.runtime import mitsuba
 from mi_prt.scene.scene import open_scene
 
 mi = mitsuba()
@@ -55,7 +55,7 @@ def room():
 
 @pytest.fixture(scope="module")
 def asset(tmp_path_factory):
-    made = mi_prt.precompute(room(), **SETTINGS)
+    made = mi_prt.precompute.precompute(room(), **SETTINGS)
     made.save(tmp_path_factory.mktemp("asset") / "room.prt")
     return made
 
@@ -214,7 +214,7 @@ def test_what_such_assets_do_not_take_is_refused(asset, tmp_path, arguments, err
 
 def test_distant_assets_refuse_components(tmp_path):
     flat = {"type": "scene", "floor": wall(0, 0, 0, [1, 0, 0], -90, diffuse(0.5)), "sky": {"type": "constant"}}
-    distant = mi_prt.precompute(flat, directions="cubemap:4", coefficients=1)
+    distant = mi_prt.precompute.precompute(flat, directions="cubemap:4", coefficients=1)
     with pytest.raises(SettingsError, match="points='samples'"):
         relight_to_file(distant, tmp_path / "a.npz", component="indirect", scene=flat)
     with pytest.raises(LightError, match="points='samples'"):

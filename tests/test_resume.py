@@ -12,15 +12,16 @@ import numpy as np
 import pytest
 
 import mi_prt
-import mi_prt.runtime
+import mi_prt.system.runtime
 from conftest import cube, diffuse, disk, rectangle, scene
-from mi_prt import AssetError, SettingsError, room
+from mi_prt.precompute import budget as room
+from mi_prt import AssetError, SettingsError
 from mi_prt.basis import pca
-from mi_prt.memory import resident_bytes
-from mi_prt.runtime import mitsuba
-from mi_prt.runtime import thread_count as mitsuba_threads
+from mi_prt.system.memory import resident_bytes
+from mi_prt.system.runtime import mitsuba
+from mi_prt.system.runtime import thread_count as mitsuba_threads
 from mi_prt.transport.interreflection import MOST_SUMMED_BOUNCES
-from mi_prt.workspace import RowFile, durable, temporary
+from mi_prt.precompute.workspace import RowFile, durable, temporary
 
 
 
@@ -52,7 +53,7 @@ def files(tmp_path_factory):
     """The file of each run that nothing disturbed."""
     folder = tmp_path_factory.mktemp("whole")
     for name, settings in RUNS.items():
-        mi_prt.precompute(SCENE, output=folder / f"{name}.prt", **settings)
+        mi_prt.precompute.precompute(SCENE, output=folder / f"{name}.prt", **settings)
     return {name: folder / f"{name}.prt" for name in RUNS}
 
 
@@ -81,7 +82,7 @@ PROGRAM = """
 import sys, time
 sys.path.insert(0, sys.argv[1])
 import mi_prt
-from mi_prt import room
+from mi_prt.precompute import budget as room
 from mi_prt.basis import pca
 from test_resume import LANES, RUNS, SCENE
 pca.NEGLIGIBLE = 0
@@ -89,7 +90,7 @@ room.LANES = LANES
 def progress(stage, done, total, detail):
     print(stage, done, total, flush=True)
     time.sleep(0.002)  # moments between the writes, in which a signal may arrive as well
-mi_prt.precompute(SCENE, output=sys.argv[2], resume=True, progress=progress, **RUNS[sys.argv[3]])
+mi_prt.precompute.precompute(SCENE, output=sys.argv[2], resume=True, progress=progress, **RUNS[sys.argv[3]])
 """
 
 
@@ -152,9 +153,9 @@ def test_interrupts_keep_what_was_computed(files, tmp_path, monkeypatch, run, st
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(room, "LANES", LANES)
-        mi_prt.precompute(SCENE, output=path, progress=interrupt, **RUNS[run])
+        mi_prt.precompute.precompute(SCENE, output=path, progress=interrupt, **RUNS[run])
     assert not path.exists() and partial(path).is_dir()
-    mi_prt.precompute(SCENE, output=path, progress=watch, resume=True, **RUNS[run])
+    mi_prt.precompute.precompute(SCENE, output=path, progress=watch, resume=True, **RUNS[run])
     assert seen[0][0] == "transport" and seen[0][1] > 10 * 40
     if stage in ("indirect", "reflections"):
         assert dict(reversed(seen))["indirect"] > 1000  # the first event of the stage
@@ -174,7 +175,7 @@ def unfinished(tmp_path):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        mi_prt.precompute(SCENE, output=path, progress=interrupt, **SETTINGS)
+        mi_prt.precompute.precompute(SCENE, output=path, progress=interrupt, **SETTINGS)
     return path
 
 
@@ -189,7 +190,7 @@ OTHER_SCENES = {
 @pytest.mark.parametrize("other", OTHER_SCENES)
 def test_another_scene_is_refused(unfinished, other):
     with pytest.raises(SettingsError, match="scene was") as caught:
-        mi_prt.precompute(OTHER_SCENES[other], output=unfinished, resume=True, **SETTINGS)
+        mi_prt.precompute.precompute(OTHER_SCENES[other], output=unfinished, resume=True, **SETTINGS)
     assert "\n" not in str(caught.value) and "delete the folder" in str(caught.value)
 
 
@@ -203,7 +204,7 @@ def test_another_scene_is_refused(unfinished, other):
 def test_other_settings_are_refused(unfinished, change):
     """Each by its name, with both values; what was computed stays and can still be continued."""
     with pytest.raises(SettingsError) as caught:
-        mi_prt.precompute(SCENE, output=unfinished, resume=True, **SETTINGS | change)
+        mi_prt.precompute.precompute(SCENE, output=unfinished, resume=True, **SETTINGS | change)
     for key, value in change.items():
         assert f"{key} was {SETTINGS.get(key, '')}" in str(caught.value) and f"now {value}" in str(caught.value)
     assert (partial(unfinished) / "visibility.rows").stat().st_size > 0
@@ -214,18 +215,18 @@ def test_another_version_is_refused(unfinished):
     recorded["versions"]["mitsuba"] = "1.0"
     (partial(unfinished) / "run.json").write_text(json.dumps(recorded))
     with pytest.raises(SettingsError, match="versions was"):
-        mi_prt.precompute(SCENE, output=unfinished, resume=True, **SETTINGS)
+        mi_prt.precompute.precompute(SCENE, output=unfinished, resume=True, **SETTINGS)
 
 
 def test_an_unfinished_run_is_not_overwritten(unfinished):
     """Without `resume` it could only be lost."""
     with pytest.raises(SettingsError, match="--resume"):
-        mi_prt.precompute(SCENE, output=unfinished, **SETTINGS)
+        mi_prt.precompute.precompute(SCENE, output=unfinished, **SETTINGS)
 
 
 def test_resume_without_anything_to_continue_starts(undisturbed, tmp_path):
     """So that a script can always pass it."""
-    mi_prt.precompute(SCENE, output=tmp_path / "a.prt", resume=True, **SETTINGS)
+    mi_prt.precompute.precompute(SCENE, output=tmp_path / "a.prt", resume=True, **SETTINGS)
     assert (tmp_path / "a.prt").read_bytes() == undisturbed.read_bytes()
 
 
@@ -235,9 +236,9 @@ def test_too_many_coefficients_cost_no_rays(tmp_path):
     settings = dict(directions="cubemap:8", edge_length=0.4)
     path, seen = tmp_path / "a.prt", []
     with pytest.raises(SettingsError, match="at most") as caught:
-        mi_prt.precompute(flat, output=path, coefficients=60, **settings)
+        mi_prt.precompute.precompute(flat, output=path, coefficients=60, **settings)
     rank = int(str(caught.value).split("at most ")[1].split()[0])
-    asset = mi_prt.precompute(
+    asset = mi_prt.precompute.precompute(
         flat, output=path, coefficients=rank, resume=True, progress=lambda *event: seen.append(event), **settings
     )
     assert len(asset.basis) == rank == 5 and seen[0][:3] == ("transport", seen[0][2], seen[0][2])
@@ -268,10 +269,10 @@ def test_a_damaged_record_is_refused_and_nothing_deleted(unfinished, content):
     """What rows belong to cannot be told any more; without versions or scene it could be any run's."""
     (partial(unfinished) / "run.json").write_text(content)
     with pytest.raises(SettingsError, match="damaged"):
-        mi_prt.precompute(SCENE, output=unfinished, resume=True, **SETTINGS)
+        mi_prt.precompute.precompute(SCENE, output=unfinished, resume=True, **SETTINGS)
     (partial(unfinished) / "run.json").write_text("{}")
     with pytest.raises(SettingsError, match="scene was not recorded"):
-        mi_prt.precompute(SCENE, output=unfinished, resume=True, **SETTINGS)
+        mi_prt.precompute.precompute(SCENE, output=unfinished, resume=True, **SETTINGS)
     assert (partial(unfinished) / "visibility.rows").stat().st_size > 0
 
 
@@ -281,7 +282,7 @@ def test_files_that_are_not_ours_are_left_alone(tmp_path, foreign):
     folder.mkdir()
     (folder / foreign).mkdir() if foreign == "folder" else (folder / foreign).write_text("precious")
     with pytest.raises(SettingsError, match=foreign):
-        mi_prt.precompute(SCENE, output=tmp_path / "a.prt", **SETTINGS)
+        mi_prt.precompute.precompute(SCENE, output=tmp_path / "a.prt", **SETTINGS)
     assert os.listdir(folder) == [foreign]
 
 
@@ -289,7 +290,7 @@ def test_a_link_in_the_place_of_the_folder_is_refused(tmp_path):
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "a.prt.partial").symlink_to(tmp_path / "elsewhere")
     with pytest.raises(SettingsError, match="link"):
-        mi_prt.precompute(SCENE, output=tmp_path / "a.prt", **SETTINGS)
+        mi_prt.precompute.precompute(SCENE, output=tmp_path / "a.prt", **SETTINGS)
 
 
 def test_a_folder_that_was_replaced_while_it_was_locked(tmp_path, monkeypatch):
@@ -316,27 +317,27 @@ def test_the_scene_is_not_overwritten(tmp_path):
     path = tmp_path / "scene.xml"
     path.write_text("<scene version='3.0.0'><shape type='sphere'/></scene>")
     with pytest.raises(SettingsError, match="the scene itself"):
-        mi_prt.precompute(path, output=path)
+        mi_prt.precompute.precompute(path, output=path)
     assert "sphere" in path.read_text() and os.listdir(tmp_path) == ["scene.xml"]
 
 
 def test_a_link_to_the_output_stays_a_link(undisturbed, tmp_path):
     (tmp_path / "data").mkdir()
     (tmp_path / "a.prt").symlink_to(tmp_path / "data" / "a.prt")
-    mi_prt.precompute(SCENE, output=tmp_path / "a.prt", **SETTINGS)
+    mi_prt.precompute.precompute(SCENE, output=tmp_path / "a.prt", **SETTINGS)
     assert (tmp_path / "a.prt").is_symlink() and (tmp_path / "data" / "a.prt").read_bytes() == undisturbed.read_bytes()
 
 
 def test_resume_needs_an_output():
     with pytest.raises(SettingsError, match="output"):
-        mi_prt.precompute(SCENE, resume=True, **SETTINGS)
+        mi_prt.precompute.precompute(SCENE, resume=True, **SETTINGS)
 
 
 def test_numbers_of_other_types_are_the_same_settings(unfinished, undisturbed):
     """The command line passes text, programs NumPy's numbers."""
     settings = dict(directions="cubemap:16", edge_length="0.10", coefficients=np.int64(24), seed=np.int32(0))
     settings |= dict(rays_per_direction=np.int16(1), bounces=np.uint8(0))
-    mi_prt.precompute(SCENE, output=unfinished, resume=True, **settings)
+    mi_prt.precompute.precompute(SCENE, output=unfinished, resume=True, **settings)
     assert unfinished.read_bytes() == undisturbed.read_bytes()
 
 
@@ -349,15 +350,15 @@ def test_results_do_not_depend_on_threads_and_memory(files, tmp_path, monkeypatc
     expected = files[run]
     if negligible:
         monkeypatch.setattr(pca, "NEGLIGIBLE", negligible)
-        mi_prt.precompute(SCENE, output=tmp_path / "a.prt", **RUNS[run])
+        mi_prt.precompute.precompute(SCENE, output=tmp_path / "a.prt", **RUNS[run])
         expected = tmp_path / "a.prt"
     before = mitsuba_threads()
-    mi_prt.runtime.set_threads(threads)
+    mi_prt.system.runtime.set_threads(threads)
     try:
         limit = resident_bytes() + 200_000_000
-        mi_prt.precompute(SCENE, output=tmp_path / "b.prt", max_memory=limit, **RUNS[run])
+        mi_prt.precompute.precompute(SCENE, output=tmp_path / "b.prt", max_memory=limit, **RUNS[run])
     finally:
-        mi_prt.runtime.set_threads(before)
+        mi_prt.system.runtime.set_threads(before)
     assert expected.read_bytes() == (tmp_path / "b.prt").read_bytes()
 
 
@@ -367,15 +368,15 @@ def test_reflections_that_are_solved_for_do_not_depend_on_threads_and_blocks(tmp
     walls = {name: rectangle(normal, -np.array(normal), 1, bsdf=diffuse([0.95, 0.9, 0.9])) for name, normal in
              {"floor": (0, 1, 0), "left": (1, 0, 0), "right": (-1, 0, 0), "back": (0, 0, 1), "roof": (0, -1, 0)}.items()}  # fmt: skip
     settings = dict(directions="cubemap:8", edge_length=0.3, bounces=bounces, paths_per_point=32)
-    mi_prt.precompute(scene(**walls), output=tmp_path / "a.prt", **settings)
+    mi_prt.precompute.precompute(scene(**walls), output=tmp_path / "a.prt", **settings)
     assert mi_prt.load(tmp_path / "a.prt").report["bounces"] > MOST_SUMMED_BOUNCES
     monkeypatch.setattr(room, "LANES", LANES)
     before = mitsuba_threads()
-    mi_prt.runtime.set_threads(3)
+    mi_prt.system.runtime.set_threads(3)
     try:
-        mi_prt.precompute(scene(**walls), output=tmp_path / "b.prt", **settings)
+        mi_prt.precompute.precompute(scene(**walls), output=tmp_path / "b.prt", **settings)
     finally:
-        mi_prt.runtime.set_threads(before)
+        mi_prt.system.runtime.set_threads(before)
     assert (tmp_path / "a.prt").read_bytes() == (tmp_path / "b.prt").read_bytes()
 
 
@@ -384,15 +385,15 @@ def test_a_share_that_is_out_of_reach_costs_no_rays(tmp_path):
     settings = dict(directions="cubemap:8", edge_length=0.3, basis="sh", coefficients="auto", bounces=0)
     path, seen = tmp_path / "a.prt", []
     with pytest.raises(SettingsError, match="resume"):
-        mi_prt.precompute(SCENE, output=path, variance=0.99999, **settings)
-    mi_prt.precompute(SCENE, output=path, variance=0.8, resume=True, progress=lambda *event: seen.append(event), **settings)
+        mi_prt.precompute.precompute(SCENE, output=path, variance=0.99999, **settings)
+    mi_prt.precompute.precompute(SCENE, output=path, variance=0.8, resume=True, progress=lambda *event: seen.append(event), **settings)
     assert seen[0][:3] == ("transport", seen[0][2], seen[0][2])
 
 
 def test_passes_of_a_fit_that_failed_do_not_reach_another(tmp_path, monkeypatch):
     """A search for a share of the variance starts its later fits from earlier ones. When it fails and so many components are
     asked for outright, that fit is the one of an undisturbed run."""
-    module, tried = sys.modules["mi_prt.precompute"], []
+    module, tried = sys.modules["mi_prt.precompute.precompute"], []
     leading = pca._leading
     monkeypatch.setattr(pca, "_leading", lambda *arguments: tried.append(arguments[2]) or leading(*arguments))
     auto = SETTINGS | dict(coefficients="auto", variance=0.993)
@@ -403,18 +404,18 @@ def test_passes_of_a_fit_that_failed_do_not_reach_another(tmp_path, monkeypatch)
     with monkeypatch.context() as patch:
         patch.setattr(module, "check_room", refuse)
         with pytest.raises(SettingsError, match="no room"):
-            mi_prt.precompute(SCENE, output=tmp_path / "a.prt", **auto)
+            mi_prt.precompute.precompute(SCENE, output=tmp_path / "a.prt", **auto)
     assert len(tried) > 1
     outright = SETTINGS | dict(coefficients=tried[1])
-    mi_prt.precompute(SCENE, output=tmp_path / "a.prt", resume=True, **outright)
-    mi_prt.precompute(SCENE, output=tmp_path / "b.prt", **outright)
+    mi_prt.precompute.precompute(SCENE, output=tmp_path / "a.prt", resume=True, **outright)
+    mi_prt.precompute.precompute(SCENE, output=tmp_path / "b.prt", **outright)
     assert (tmp_path / "a.prt").read_bytes() == (tmp_path / "b.prt").read_bytes()
 
 
 def test_paths_kept_in_a_span_that_was_given_up_do_not_reach_another(tmp_path, monkeypatch):
     """Reflections make a second fit necessary, to more of direct transport; there is no room for it. As many coefficients as the first
     fit had, asked for outright, have another span by a little: the paths of an undisturbed run are told in that one."""
-    module, fits = sys.modules["mi_prt.precompute"], []
+    module, fits = sys.modules["mi_prt.precompute.precompute"], []
     walls = {name: rectangle(normal, -np.array(normal), 1) for name, normal in dict(a=(0, 1, 0), b=(1, 0, 0), c=(0, 0, 1)).items()}
     corner = scene(**{name: wall | {"bsdf": diffuse(0.9)} for name, wall in (walls | dict(box=cube((-0.2, -0.6, -0.2), 0.4))).items()})
     settings = dict(directions="cubemap:8", edge_length=0.2, bounces=1, indirect="paths", paths_per_point=256)
@@ -427,10 +428,10 @@ def test_paths_kept_in_a_span_that_was_given_up_do_not_reach_another(tmp_path, m
     with monkeypatch.context() as patch:
         patch.setattr(module, "check_room", refuse)
         with pytest.raises(SettingsError, match="no room"):
-            mi_prt.precompute(corner, output=tmp_path / "a.prt", coefficients="auto", variance=0.97, **settings)
+            mi_prt.precompute.precompute(corner, output=tmp_path / "a.prt", coefficients="auto", variance=0.97, **settings)
     assert 40 < fits[0] < fits[1] and list(partial(tmp_path / "a.prt").glob("paths-*.rows"))
-    mi_prt.precompute(corner, output=tmp_path / "a.prt", coefficients=fits[0], resume=True, **settings)
-    mi_prt.precompute(corner, output=tmp_path / "b.prt", coefficients=fits[0], **settings)
+    mi_prt.precompute.precompute(corner, output=tmp_path / "a.prt", coefficients=fits[0], resume=True, **settings)
+    mi_prt.precompute.precompute(corner, output=tmp_path / "b.prt", coefficients=fits[0], **settings)
     assert (tmp_path / "a.prt").read_bytes() == (tmp_path / "b.prt").read_bytes()
 
 
@@ -520,12 +521,12 @@ def test_reads_beyond_what_the_system_gives_at_once(rows, monkeypatch):
 @pytest.mark.parametrize("bad", ["0", "-1G", "many", "3 apples", "nan", 0, True, "inf", ""])
 def test_bad_memory(bad):
     with pytest.raises(SettingsError, match="memory"):
-        mi_prt.precompute(SCENE, max_memory=bad, **SETTINGS)
+        mi_prt.precompute.precompute(SCENE, max_memory=bad, **SETTINGS)
 
 
 def test_too_little_memory_says_how_much_is_needed():
     with pytest.raises(SettingsError, match="raise max_memory"):
-        mi_prt.precompute(SCENE, max_memory="10M", **SETTINGS)
+        mi_prt.precompute.precompute(SCENE, max_memory="10M", **SETTINGS)
 
 
 @pytest.mark.parametrize("run", RUNS)
@@ -535,17 +536,17 @@ def test_a_run_stays_within_its_memory_and_gives_the_same_file(files, tmp_path, 
 import sys; sys.path.insert(0, sys.argv[1])
 import mi_prt
 from mi_prt.basis import pca
-from mi_prt.memory import resident_bytes
-from mi_prt.runtime import mitsuba, peak_memory_bytes
+from mi_prt.system.memory import resident_bytes
+from mi_prt.system.runtime import mitsuba, peak_memory_bytes
 from mi_prt.scene.scene import open_scene
 from test_resume import RUNS, SCENE
 pca.NEGLIGIBLE = 0
 settings = RUNS[sys.argv[3]]
-mi_prt.precompute(SCENE, **settings | dict(directions="cubemap:2", edge_length=1, coefficients=4))  # what Mitsuba and Embree take once
+mi_prt.precompute.precompute(SCENE, **settings | dict(directions="cubemap:2", edge_length=1, coefficients=4))  # what Mitsuba and Embree take once
 limit = resident_bytes() + 60_000_000
 def blocks(**options):
     stages = []
-    mi_prt.precompute(SCENE, progress=lambda stage, *_: stages.append(stage), **options, **settings)
+    mi_prt.precompute.precompute(SCENE, progress=lambda stage, *_: stages.append(stage), **options, **settings)
     return stages.count("transport")
 limited = blocks(output=sys.argv[2], max_memory=limit)
 print(limit, peak_memory_bytes(), limited, blocks())

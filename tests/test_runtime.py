@@ -11,7 +11,9 @@ import time
 
 import pytest
 
-from mi_prt import doctor, llvm, runtime
+from mi_prt.system import doctor
+from mi_prt.system import llvm
+from mi_prt.system import runtime
 from mi_prt.errors import RuntimeSetupError, SettingsError
 
 linux_only = pytest.mark.skipif(sys.platform != "linux", reason="the linker and /proc are Linux's")
@@ -101,7 +103,7 @@ def test_importing_mi_prt_selects_unless_the_user_has(fake_library, tmp_path, ch
 ])
 def test_unusable_llvm_gives_a_typed_error_in_one_line(fake_library, tmp_path, name, content, said):
     path = fake_library(name, content) if content is not None else str(tmp_path / name)
-    run = run_python("from mi_prt.runtime import mitsuba; mitsuba()", DRJIT_LIBLLVM_PATH=path)
+    run = run_python("from mi_prt.system.runtime import mitsuba; mitsuba()", DRJIT_LIBLLVM_PATH=path)
     assert run.returncode == 1  # an abort would be negative
     message = run.stderr.splitlines()[-1]
     assert message.startswith("mi_prt.errors.RuntimeSetupError: ")
@@ -111,7 +113,7 @@ def test_unusable_llvm_gives_a_typed_error_in_one_line(fake_library, tmp_path, n
 def test_drjit_imported_first_without_a_usable_llvm_is_told_apart(fake_library, tmp_path):
     usable = fake_library("libLLVM-22.so")
     code = ("import os, drjit; del os.environ['DRJIT_LIBLLVM_PATH']\n"
-            "from mi_prt.runtime import mitsuba; mitsuba()")
+            "from mi_prt.system.runtime import mitsuba; mitsuba()")
     run = run_python(code, DRJIT_LIBLLVM_PATH=str(tmp_path / "none.so"), LD_LIBRARY_PATH=str(tmp_path))
     message = run.stderr.splitlines()[-1]
     assert run.returncode == 1 and message.startswith("mi_prt.errors.RuntimeSetupError: ")
@@ -119,7 +121,7 @@ def test_drjit_imported_first_without_a_usable_llvm_is_told_apart(fake_library, 
 
 
 def test_another_variant_is_refused_by_name():
-    run = run_python("from mi_prt.runtime import mitsuba\n"
+    run = run_python("from mi_prt.system.runtime import mitsuba\n"
                      "import mitsuba as mi; mi.set_variant('scalar_rgb'); mitsuba()", **_usable_llvm())
     message = run.stderr.splitlines()[-1]
     assert run.returncode == 1 and message.startswith("mi_prt.errors.RuntimeSetupError: ")
@@ -128,7 +130,7 @@ def test_another_variant_is_refused_by_name():
 
 def test_a_usable_variant_is_kept_and_messages_go_to_stderr():
     """A result on stdout is parsed by programs, so not one message of Mitsuba may appear there."""
-    run = run_python("from mi_prt.runtime import mitsuba, quiet_mitsuba\n"
+    run = run_python("from mi_prt.system.runtime import mitsuba, quiet_mitsuba\n"
                      "mi = mitsuba(); quiet_mitsuba(); print(mi.variant(), mitsuba().variant())\n"
                      "mi.Log(mi.LogLevel.Warn, 'told'); mi.Log(mi.LogLevel.Info, 'not told')", **_usable_llvm())
     assert run.stdout == "llvm_ad_rgb llvm_ad_rgb\n", run.stderr
@@ -183,7 +185,7 @@ def test_senseless_thread_counts_are_refused(count):
 def test_peak_memory_counts_this_process_alone():
     """The child allocates 64 MiB; the parent's 256 MiB, which getrusage would report, must not show."""
     parent = bytearray(b"\1" * (256 << 20))
-    run = run_python("from mi_prt.runtime import peak_memory_bytes as peak\n"
+    run = run_python("from mi_prt.system.runtime import peak_memory_bytes as peak\n"
                      "before = peak(); block = bytearray(b'\\1' * 1024) * (64 << 10); print(before, peak() - before)")
     before, grown = map(int, run.stdout.split())
     assert before < len(parent)
@@ -213,7 +215,7 @@ def test_missing_platforms_are_named_with_a_remedy(monkeypatch):
 def test_opengl_imported_before_for_a_screen_is_told_apart():
     run = run_python("import os; os.environ['PYOPENGL_PLATFORM'] = 'glx'; import OpenGL.platform\n"
                      "del os.environ['PYOPENGL_PLATFORM']\n"
-                     "from mi_prt.runtime import raster_platform; raster_platform()")
+                     "from mi_prt.system.runtime import raster_platform; raster_platform()")
     assert "PyOpenGL was imported before mi_prt and took GLXPlatform" in run.stderr
 
 

@@ -12,7 +12,7 @@ from mi_prt.points.particles import PARTICLES, STEPS, WARM_UP, cross_surfaces, f
 from mi_prt.points.sample_locator import ALIGNMENT, REACH, SHARPNESS, SampleLocator
 from mi_prt.points.samples import scatter_samples
 from mi_prt.points.thinning import embedded, thin
-from mi_prt.runtime import mitsuba
+from mi_prt.system.runtime import mitsuba
 from mi_prt.scene.scene import open_scene
 
 mi = mitsuba()

@@ -11,7 +11,7 @@ import mi_prt
 from conftest import bias, cube, diffuse, disk, rectangle, relative_l2, scene, sphere, uniform_sky
 from mi_prt import LightError, SceneError
 from mi_prt.lighting.scene_light import scene_light
-from mi_prt.runtime import mitsuba
+from mi_prt.system.runtime import mitsuba
 from mi_prt.scene.scene import open_scene
 
 mi = mitsuba()
@@ -97,7 +97,7 @@ def curve(path):
 def test_a_scene_of_shapes_that_cannot_be_sampled(tmp_path):
     """They cast shadows, but nothing is left to light; the message names their kind and what to use."""
     with pytest.raises(SceneError, match="BSplineCurve"):
-        mi_prt.precompute(scene(hair=curve(tmp_path / "curve.txt")), directions="cubemap:4")
+        mi_prt.precompute.precompute(scene(hair=curve(tmp_path / "curve.txt")), directions="cubemap:4")
 
 
 # --- parameters ----------------------------------------------------------------------------------------------------
@@ -107,7 +107,7 @@ def test_parameters_of_a_file(tmp_path):
     """Values for <default> reach the scene as numbers or text; one that the file does not have is refused."""
     (tmp_path / "scene.xml").write_text(XML)
     for parameters, side, grey in [(None, 1, 0.5), ({"side": 3, "grey": "0.25"}, 3, 0.25), ({"side": 0.5}, 0.5, 0.5)]:
-        asset = mi_prt.precompute(tmp_path / "scene.xml", parameters, directions="cubemap:4", edge_length=10.0)
+        asset = mi_prt.precompute.precompute(tmp_path / "scene.xml", parameters, directions="cubemap:4", edge_length=10.0)
         assert np.abs(asset.points.positions).max() == pytest.approx(side)
         np.testing.assert_allclose(asset.points.albedo, grey, rtol=1e-5)
         assert asset.scene["parameters"] == {k: str(v) for k, v in (parameters or {}).items()}
@@ -127,7 +127,7 @@ def test_relative_paths_and_files_beside_the_scene(tmp_path, monkeypatch):
         '<texture type="bitmap" name="reflectance"><string name="filename" value="grey.exr"/></texture></bsdf></shape></scene>'
     )
     monkeypatch.chdir(tmp_path)
-    asset = mi_prt.precompute("a/scene.xml", directions="cubemap:4", edge_length=10.0)
+    asset = mi_prt.precompute.precompute("a/scene.xml", directions="cubemap:4", edge_length=10.0)
     np.testing.assert_allclose(asset.points.albedo, 0.25, rtol=1e-3)
     assert asset.scene["path"] == str(folder / "scene.xml")
 
@@ -176,7 +176,7 @@ MATERIALS = {
 def test_materials(name):
     """The diffuse part that a plugin's manual names is modelled, the rest is named, with the shape and a share in 0…1."""
     material, words, albedo, two_sided = MATERIALS[name]
-    asset = mi_prt.precompute(
+    asset = mi_prt.precompute.precompute(
         scene(thing=rectangle(bsdf=material(), id="thing"), other=disk(position=(0, 5, 0))),
         directions="cubemap:4",
         edge_length=1.0,
@@ -207,7 +207,7 @@ def test_the_share_that_is_left_out_is_that_of_the_light():
         ),  # all passes; half of it is modelled as reflected
     }
     for name, (material, share) in materials.items():
-        asset = mi_prt.precompute(scene(a=rectangle(bsdf=material)), directions="cubemap:4", edge_length=1.0)
+        asset = mi_prt.precompute.precompute(scene(a=rectangle(bsdf=material)), directions="cubemap:4", edge_length=1.0)
         assert asset.scene["left_out"][0]["share"] == pytest.approx(share, abs=0.05), name
 
 
@@ -221,7 +221,7 @@ def test_local_lights_are_listed_and_distant_ones_are_not():
     opened = open_scene(parts)
     assert sorted(e.class_name() for e in opened.local_emitters) == ["AreaLight", "PointLight", "SpotLight"]
     assert sorted(e.class_name() for e in opened.distant_emitters) == ["ConstantBackgroundEmitter", "DirectionalEmitter"]
-    asset = mi_prt.precompute(parts, directions="cubemap:4", edge_length=0.5)
+    asset = mi_prt.precompute.precompute(parts, directions="cubemap:4", edge_length=0.5)
     whats = " ".join(e["what"] for e in asset.scene["left_out"])
     assert all(kind in whats for kind in ("AreaLight", "PointLight", "SpotLight")) and "Constant" not in whats
     assert {s["name"] for s in asset.points.surfaces} == {"floor", "lamp"}
@@ -230,8 +230,8 @@ def test_local_lights_are_listed_and_distant_ones_are_not():
 def test_shapes_without_points_are_named_and_cast_shadows(tmp_path):
     """A curve is not sampled: it is named among what is left out, and it takes light from the floor."""
     parts = dict(floor=rectangle(position=(0, -0.2, 0)))
-    plain = mi_prt.precompute(scene(**parts), directions="cubemap:16", edge_length=0.5)
-    asset = mi_prt.precompute(scene(**parts, hair=curve(tmp_path / "curve.txt")), directions="cubemap:16", edge_length=0.5)
+    plain = mi_prt.precompute.precompute(scene(**parts), directions="cubemap:16", edge_length=0.5)
+    asset = mi_prt.precompute.precompute(scene(**parts, hair=curve(tmp_path / "curve.txt")), directions="cubemap:16", edge_length=0.5)
     assert ["hair"] in [e["shapes"] for e in asset.scene["left_out"]]
     assert len(asset.points) == len(plain.points)
     assert asset.irradiance(uniform_sky()).min() < 0.995 * plain.irradiance(uniform_sky()).min()
@@ -323,7 +323,7 @@ def test_a_loaded_scene_is_untouched_by_precompute():
     """Every parameter is what it was, and the image too."""
     mi_scene = mi.load_dict(stage(True, bulb={"type": "point", "position": [0, 2, 0]}), optimize=False, parallel=False)
     before, image = values_of(mi_scene), rendered(mi_scene, spp=4)
-    mi_prt.precompute(mi_scene, directions="cubemap:4", edge_length=1.0)
+    mi_prt.precompute.precompute(mi_scene, directions="cubemap:4", edge_length=1.0)
     after = values_of(mi_scene)
     assert before.keys() == after.keys()
     for key, value in before.items():
@@ -334,7 +334,7 @@ def test_a_loaded_scene_is_untouched_by_precompute():
 def test_a_scene_dict_is_untouched_by_precompute():
     parts = stage(True)
     copy = repr(parts)
-    mi_prt.precompute(parts, directions="cubemap:4", edge_length=1.0)
+    mi_prt.precompute.precompute(parts, directions="cubemap:4", edge_length=1.0)
     assert repr(parts) == copy
 
 
@@ -342,7 +342,7 @@ def test_a_loaded_merged_scene_gives_the_same_light():
     """mi.load_dict merges meshes by default; irradiance does not depend on it."""
     parts = scene(a=rectangle(bsdf=diffuse(), size=2), b=cube((0, 0.5, 0), 0.5, bsdf=diffuse()))
     settings = dict(directions="cubemap:8", edge_length=0.5)
-    one, two = mi_prt.precompute(parts, **settings), mi_prt.precompute(mi.load_dict(parts), **settings)
+    one, two = mi_prt.precompute.precompute(parts, **settings), mi_prt.precompute.precompute(mi.load_dict(parts), **settings)
 
     def summary(asset):
         order = np.lexsort(np.round(np.hstack([asset.points.positions, asset.points.normals]), 4).T)
@@ -410,7 +410,7 @@ def test_images_load_with_a_single_thread(tmp_path):
     """Mitsuba hands them to a worker of Dr.Jit, and without one waited forever: in a process of its own, which would hang."""
     root = Path(__file__).resolve().parent.parent
     program = (
-        "import sys; from mi_prt.runtime import set_threads, thread_count; from mi_prt.scene.scene import open_scene; "
+        "import sys; from mi_prt.system.runtime import set_threads, thread_count; from mi_prt.scene.scene import open_scene; "
         "set_threads(1); open_scene(sys.argv[1]); print(thread_count())"
     )
     command = [sys.executable, "-c", program, str(root / "scenes" / "cornell_sky.xml")]

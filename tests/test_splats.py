@@ -18,7 +18,7 @@ from mi_prt.render.display import display
 from mi_prt.render.image import resized
 from mi_prt.render.raster import RasterScene
 from mi_prt.render.splats import SplatScene
-from mi_prt.runtime import count_kernels, mitsuba
+from mi_prt.system.runtime import count_kernels, mitsuba
 from mi_prt.scene.scene import open_scene
 
 SPACING = 0.1

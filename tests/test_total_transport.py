@@ -9,10 +9,10 @@ from conftest import NOTHING, bias, cube, diffuse, rectangle, relative_l2, sampl
 
 import mi_prt
 from mi_prt import LightWarning, SceneError, SettingsError
-from mi_prt.provenance import open_scene_of
+from mi_prt.asset.provenance import open_scene_of
 from mi_prt.render.integrator import integrator_for
-from mi_prt.runtime import mitsuba
-from mi_prt.settings import Settings
+from mi_prt.system.runtime import mitsuba
+from mi_prt.precompute.settings import Settings
 
 mi = mitsuba()
 
@@ -39,7 +39,7 @@ SMALL = dict(directions="cubemap:8", edge_length=1.0, paths_per_point=64, bounce
 
 
 def precompute(parts, **settings):
-    return mi_prt.precompute(parts, **(SMALL | settings))
+    return mi_prt.precompute.precompute(parts, **(SMALL | settings))
 
 
 def lossless(parts, **settings):
@@ -231,7 +231,7 @@ def test_energy_told_of_each_reflection():
 )
 def test_settings_out_of_range_are_refused(setting, value, message):
     with pytest.raises(SettingsError) as raised:
-        mi_prt.precompute(corner(), **{setting: value})
+        mi_prt.precompute.precompute(corner(), **{setting: value})
     assert str(raised.value) == message
 
 
@@ -273,7 +273,7 @@ def opened():
 
 @pytest.fixture(scope="module", params=[0, 2, "auto"])
 def pictured(request):
-    return mi_prt.precompute(cornell(), directions="cubemap:16", edge_length=0.15, bounces=request.param, paths_per_point=128)
+    return mi_prt.precompute.precompute(cornell(), directions="cubemap:16", edge_length=0.15, bounces=request.param, paths_per_point=128)
 
 
 def test_compare_takes_a_reference_of_as_many_reflections(pictured, tmp_path):

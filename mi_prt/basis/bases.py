@@ -3,7 +3,9 @@
 from math import inf
 
 from ..errors import SettingsError
-from . import haar, harmonics, pca
+from . import haar
+from . import harmonics
+from . import pca
 from .haar import HaarBasis, SharedHaarBasis, check_haar, fit_haar, fit_haar_shared
 from .harmonics import HarmonicBasis, check_harmonics, fit_harmonics, most_harmonics
 from .none import NoBasis

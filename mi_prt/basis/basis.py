@@ -4,7 +4,7 @@ from abc import ABC, abstractmethod
 
 from ..lighting.cells import cell_radiance
 from ..lighting.lattice import on_lattice
-from ..parallel import one_blas_thread
+from ..system.parallel import one_blas_thread
 
 
 class Basis(ABC):

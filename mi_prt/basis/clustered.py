@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ..parallel import one_blas_thread
+from ..system.parallel import one_blas_thread
 
 OVERSAMPLING = 16
 ITERATIONS = 3

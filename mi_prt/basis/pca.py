@@ -16,7 +16,7 @@ Two ways lead to them, and the cheaper one for the shape at hand is taken:
 import numpy as np
 import scipy.linalg
 
-from ..parallel import map_chunks, one_blas_thread
+from ..system.parallel import map_chunks, one_blas_thread
 from .linear import LinearBasis
 from .rows import Rows
 from .target import Fit, Target, check_room

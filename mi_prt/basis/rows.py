@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..parallel import BLOCK_ROWS, map_chunks
+from ..system.parallel import BLOCK_ROWS, map_chunks
 
 CHUNKS = 16  # parts that the rows are split into for the threads; fixed, so that sums do not depend on their number
 

@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 import scipy.linalg
 
-from ..parallel import map_chunks, one_blas_thread
+from ..system.parallel import map_chunks, one_blas_thread
 from .linear import LinearBasis
 from .pca import PCA, fixed_signs
 from .target import Fit, shares

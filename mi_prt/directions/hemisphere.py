@@ -8,7 +8,7 @@ other one are found without a search.
 import numpy as np
 
 from ..errors import SettingsError
-from ..runtime import mitsuba
+from ..system.runtime import mitsuba
 
 LEAST, MOST = 16, 1 << 16
 _SKEW = 1.5  # between the sides of the grid, at most

@@ -10,11 +10,12 @@ import numpy as np
 from ..errors import SettingsError
 from ..lighting.emission import emission_of
 from ..lighting.scene_light import chosen_local_light, lit_scene, turned_light
-from ..meshless_asset import MeshlessAsset
-from ..provenance import open_scene_of
+from ..asset.meshless_asset import MeshlessAsset
+from ..asset.provenance import open_scene_of
 from ..render.display import display, exposure
 from ..render.image import coverage, pick_sensor, render_image, resized
-from . import ground_truth, metrics
+from . import ground_truth
+from . import metrics
 from .local_lights import measure_error
 from .report import write_report
 

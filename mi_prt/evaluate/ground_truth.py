@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..lighting.scene_light import point_emitter
-from ..runtime import mitsuba
+from ..system.runtime import mitsuba
 from ..scene.scene import scale_of
 
 LANES = 1 << 21

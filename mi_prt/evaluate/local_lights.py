@@ -6,7 +6,8 @@ from ..lighting.environment import LightWarning
 from ..lighting.light import Light
 from ..lighting.local import hull_warning
 from ..lighting.scene_light import lit_scene
-from . import ground_truth, metrics
+from . import ground_truth
+from . import metrics
 
 MEASURED_POINTS = 4096
 MEASURED_PATHS = 128  # from each of them, where light is reflected

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ..render.display import LUMINANCE, display
-from ..render.export import write_displayed, write_image
+from ..output.export import write_displayed, write_image
 from . import metrics
 
 _PAGE = """<!doctype html>

@@ -212,7 +212,7 @@ def _read_exr(path):
 
 
 def _read_by_mitsuba(path):
-    from ..runtime import mitsuba
+    from ..system.runtime import mitsuba
 
     mi = mitsuba()
     try:
@@ -222,7 +222,7 @@ def _read_by_mitsuba(path):
 
 
 def _from_bitmap(bitmap):
-    from ..runtime import mitsuba
+    from ..system.runtime import mitsuba
 
     mi = mitsuba()
     if not isinstance(bitmap, mi.Bitmap):

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..parallel import one_blas_thread
+from ..system.parallel import one_blas_thread
 from .cells import cell_radiance
 from .environment import rotation_matrix
 from .light import Light, as_light

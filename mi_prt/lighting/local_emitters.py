@@ -4,7 +4,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ..errors import LightError, SettingsError
-from ..runtime import mitsuba
+from ..system.runtime import mitsuba
 from ..scene.traversal import children, transform_of
 from .emission import flat_emission
 from .light import as_light

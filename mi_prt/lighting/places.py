@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ..runtime import mitsuba
+from ..system.runtime import mitsuba
 
 _OWN = 12  # floats of a place
 

@@ -6,7 +6,7 @@ import numpy as np
 import scipy.ndimage
 
 from ..errors import LightError
-from ..runtime import mitsuba
+from ..system.runtime import mitsuba
 from ..scene.scene import is_dark, rebuilt_scene
 from ..scene.traversal import children, transform_of
 from .environment import EnvironmentMap

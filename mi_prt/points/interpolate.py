@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ..runtime import mitsuba
+from ..system.runtime import mitsuba
 from ..scene.materials import facing
 from .locate import PatchLocator
 

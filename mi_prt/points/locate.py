@@ -3,7 +3,7 @@
 import numpy as np
 
 from ..errors import SceneError
-from ..runtime import mitsuba
+from ..system.runtime import mitsuba
 from ..scene.scene import mesh_arrays
 from ..scene.surface_table import SurfaceTable
 from .tessellate import TESSELLATED_SHAPES

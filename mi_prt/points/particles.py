@@ -11,7 +11,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from ..errors import SceneError
-from ..runtime import mitsuba
+from ..system.runtime import mitsuba
 from ..scene.materials import facing, reflectance_at
 from ..scene.surface_table import SurfaceTable
 

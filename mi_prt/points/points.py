@@ -6,7 +6,7 @@ from functools import cached_property
 import numpy as np
 
 from ..errors import SceneError, SettingsError
-from ..runtime import mitsuba
+from ..system.runtime import mitsuba
 from .hull import ConvexHull
 from .lattice import Patches, node_count
 from .tessellate import TESSELLATED_SHAPES, patch_levels, tessellate

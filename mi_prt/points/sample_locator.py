@@ -3,7 +3,7 @@
 import numpy as np
 
 from ..errors import SceneError
-from ..runtime import mitsuba
+from ..system.runtime import mitsuba
 
 REACH = 2.5  # radii up to which a sample is found
 VOXEL = 1.5  # radii along the edge of a voxel

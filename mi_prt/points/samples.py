@@ -49,6 +49,11 @@ class Samples:
         """Slices of points."""
         return [slice(int(a), int(b)) for a, b in zip(self.starts, self.starts[1:])]
 
+    @property
+    def labels(self):
+        """Cluster of each point, (n,) int32."""
+        return np.repeat(np.arange(len(self.roots), dtype=np.int32), np.diff(self.starts))
+
     def locator(self):
         """A SampleLocator of these points."""
         return SampleLocator(self.points.positions, self.points.normals, self.radius)
@@ -163,7 +168,7 @@ def _lanes(vectors):
     """Vectors (m, 3) in Dr.Jit, gathered: what is read lane by lane compiles another kernel where its memory is aligned otherwise."""
     import drjit as dr
 
-    from ..runtime import mitsuba
+    from ..system.runtime import mitsuba
 
     mi = mitsuba()
     return dr.gather(mi.Vector3f, mi.Float(vectors.ravel()), dr.arange(mi.UInt32, len(vectors)))

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import RuntimeSetupError, SettingsError
-from ..runtime import pyrender as load_pyrender
-from ..runtime import raster_install_command, raster_platform
+from ..system.runtime import pyrender as load_pyrender
+from ..system.runtime import raster_install_command, raster_platform
 
 pyrender = load_pyrender()  # chooses the OpenGL platform, before OpenGL is imported
 from OpenGL import GL  # noqa: E402

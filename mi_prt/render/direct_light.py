@@ -1,6 +1,6 @@
 """Direct light at pixels, by shadow rays."""
 
-from ..runtime import mitsuba
+from ..system.runtime import mitsuba
 from ..scene.materials import facing
 
 SHADOW_END = 1e-3  # share of the way to a light at which its shadow ray ends: lights lie on surfaces

@@ -5,7 +5,7 @@ from contextlib import contextmanager
 import numpy as np
 
 from ..errors import SettingsError
-from ..runtime import mitsuba
+from ..system.runtime import mitsuba
 from .integrator import integrator_for
 
 MAX_PIXELS = 1 << 26

@@ -4,14 +4,14 @@ from functools import cache
 
 import numpy as np
 
-from ..opening import load
+from ..asset.opening import load
 from ..errors import InputError, SettingsError
 from ..lighting.emission import emission_of
 from ..lighting.local_emitters import local_scene_light
 from ..lighting.places import Places
 from ..lighting.scene_light import scene_light
-from ..meshless_asset import MeshlessAsset
-from ..runtime import VARIANTS, mitsuba
+from ..asset.meshless_asset import MeshlessAsset
+from ..system.runtime import VARIANTS, mitsuba
 from ..scene.materials import reflectance_at
 from ..scene.scene import Scene, SceneSource
 from ..scene.traversal import digest_of

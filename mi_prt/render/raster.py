@@ -17,7 +17,7 @@ import numpy as np
 
 from ..errors import SceneError, SettingsError
 from ..points.lattice import lattice_nodes, lattice_triangles
-from ..runtime import mitsuba
+from ..system.runtime import mitsuba
 from .canvas import draw, drawing, make_current, new_primitive, open_canvas
 from .display import display
 from .view import view_of

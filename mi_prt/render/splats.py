@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..errors import SettingsError
-from ..runtime import mitsuba
+from ..system.runtime import mitsuba
 from ..scene.materials import facing, reflectance_at
 from .canvas import check_size
 from .display import display

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..runtime import mitsuba
+from ..system.runtime import mitsuba
 from .traversal import children
 
 # Class names of Mitsuba's materials, and the texture that holds their diffuse albedo.

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import SceneError
-from ..runtime import a_worker_at_least, mitsuba
+from ..system.runtime import a_worker_at_least, mitsuba
 from .materials import Material, model_material
 from .traversal import children, digest_of, transform_of
 

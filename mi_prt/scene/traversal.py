@@ -4,7 +4,7 @@ import hashlib
 
 import numpy as np
 
-from ..runtime import mitsuba
+from ..system.runtime import mitsuba
 
 
 def children(node):

@@ -4,8 +4,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..parallel import BLOCK_ROWS, map_chunks
-from ..runtime import mitsuba
+from ..system.parallel import BLOCK_ROWS, map_chunks
+from ..system.runtime import mitsuba
 
 LANES = 1 << 22  # rays of a wavefront: a few million keep both cores busy in a few hundred MB
 RAY_OFFSET = 2e-5  # share of the scene's scale by which rays start off the surface

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ..runtime import mitsuba
+from ..system.runtime import mitsuba
 from .direct import LANES, RAY_OFFSET
 
 RAISE = 0.25  # share of a sample's area whose square root is the least height of a light over it, see `point_irradiance`

@@ -10,8 +10,8 @@ import numpy as np
 import scipy.sparse
 
 from ..directions.hemisphere import frame_of, frames
-from ..parallel import map_chunks
-from ..runtime import mitsuba
+from ..system.parallel import map_chunks
+from ..system.runtime import mitsuba
 from ..scene.materials import facing, reflectance_at
 from .direct import LANES, RAY_OFFSET
 

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse
 
-from ..parallel import BLOCK_ROWS, map_chunks
+from ..system.parallel import BLOCK_ROWS, map_chunks
 from ..points.locate import PatchLocator
-from ..runtime import mitsuba
+from ..system.runtime import mitsuba
 from ..scene.materials import facing, reflectance_at
 from .direct import LANES, RAY_OFFSET
 

@@ -12,7 +12,7 @@ import scipy.linalg
 from scipy.sparse.linalg import LinearOperator, bicgstab
 
 from ..errors import SceneError
-from ..parallel import one_blas_thread
+from ..system.parallel import one_blas_thread
 
 BOUNCE_TOLERANCE = 1e-3  # share of the irradiance under a uniform sky that `auto` leaves out
 MOST_COUNTED_BOUNCES = 64  # to which `auto` follows the energy of reflections

@@ -9,8 +9,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ..lighting.places import Places
-from ..runtime import mitsuba
+from ..system.runtime import mitsuba
 from .examples import raised_height
+from .hemispheres import cluster_frames
 
 TOLERANCE = 0.1  # share of its distance by which a light may lie behind what the depth buffer shows
 BEHIND = 0.03  # the same for points behind the surface that is nearest to the light, so that none leaks through it
@@ -32,11 +33,9 @@ class LocalDirect:
     ----------
     samples : Samples
     depth : DepthBuffers
-    rotations : (n, 3, 3)
-        From the hemisphere's frame to that of each point.
     """
 
-    def __init__(self, samples, depth, rotations):
+    def __init__(self, samples, depth):
         import drjit as dr
 
         mi = mitsuba()
@@ -49,8 +48,8 @@ class LocalDirect:
         self._means = mi.Float(depth.means.ravel())
         self._vectors = mi.Float(np.pad(depth.vectors, ((0, 0), (0, 0), (0, extra))).ravel())
         self._coefficients = mi.Float(np.pad(depth.coefficients, ((0, 0), (0, extra))).ravel())
-        labels = np.repeat(np.arange(len(samples.roots)), np.diff(samples.starts))
-        self._labels = mi.UInt32(labels.astype(np.uint32))
+        self._labels = mi.UInt32(samples.labels.astype(np.uint32))
+        rotations = np.concatenate([cluster_frames(points.normals[cluster]) for cluster in samples.clusters])
         axes = (np.pad(axis, ((0, 0), (0, 1))) for axis in np.moveaxis(rotations.astype(np.float32), 2, 0))
         self._points = mi.Float(np.hstack([points.positions, points.areas[:, None], *axes]).ravel())
         self._far = dr.opaque(mi.Float, FAR * depth.extent)

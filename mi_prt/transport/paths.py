@@ -9,8 +9,8 @@ is no emitter to aim at: leaving in a direction of the reflection's own cosine d
 import numpy as np
 import scipy.sparse
 
-from ..parallel import BLOCK_ROWS, map_chunks
-from ..runtime import mitsuba
+from ..system.parallel import BLOCK_ROWS, map_chunks
+from ..system.runtime import mitsuba
 from ..scene.materials import facing, reflectance_at
 from .direct import LANES, RAY_OFFSET
 from .hops import NOTHING

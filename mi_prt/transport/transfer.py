@@ -15,7 +15,7 @@ import numpy as np
 
 from ..basis.clustered import leading_components
 from ..errors import SceneError
-from ..parallel import map_chunks
+from ..system.parallel import map_chunks
 
 MOST_REFLECTIONS = 0.9999  # spectral radius of one hop from which on reflections do not end
 _POWER_STEPS = 200

@@ -8,27 +8,27 @@ from dataclasses import asdict
 import numpy as np
 import scipy.sparse
 
-from .basis.clustered import leading_components
-from .directions.hemisphere import Hemisphere
-from .errors import LightError, SettingsError
-from .indirect import GREY
-from .lighting.emission import emission_of
-from .lighting.light import Light, as_light
-from .lighting.local_emitters import local_scene_light
-from .lighting.local_lights import PointLight
-from .memory import resident_bytes
-from .meshless_asset import MeshlessAsset
-from .meshless_file import as_stored
-from .parallel import map_chunks
-from .points.samples import scatter_samples
-from .runtime import versions
-from .transport.depth import DepthBuffers, compress
-from .transport.direct import LANES
-from .transport.examples import RAISE, trace_examples
-from .transport.hemispheres import NOTHING, HemisphereTracer, cluster_frames, gathered
-from .transport.local_direct import LocalDirect
-from .transport.transfer import all_reflections, fit_senders
-from .transport.transfer_matrix import Transfer, within_budget
+from ..basis.clustered import leading_components
+from ..directions.hemisphere import Hemisphere
+from ..errors import LightError, SettingsError
+from .reflections import GREY
+from ..lighting.emission import emission_of
+from ..lighting.light import Light, as_light
+from ..lighting.local_emitters import local_scene_light
+from ..lighting.local_lights import PointLight
+from ..system.memory import resident_bytes
+from ..asset.meshless_asset import MeshlessAsset
+from ..asset.meshless_file import as_stored
+from ..system.parallel import map_chunks
+from ..points.samples import scatter_samples
+from ..system.runtime import versions
+from ..transport.depth import DepthBuffers, compress
+from ..transport.direct import LANES
+from ..transport.examples import RAISE, trace_examples
+from ..transport.hemispheres import NOTHING, HemisphereTracer, cluster_frames, gathered
+from ..transport.local_direct import LocalDirect
+from ..transport.transfer import all_reflections, fit_senders
+from ..transport.transfer_matrix import Transfer, within_budget
 
 FUNCTIONALS = 256  # random sums over receivers that tell how much light at a sample matters
 IMPORTANCE_DIRECTIONS = 256  # rays of each receiver for that
@@ -178,7 +178,7 @@ class MeshlessPrecomputation:
     def _clusters(self, workspace, senders):
         """For each cluster: depth buffers, and with senders receivers, transfer in their basis, and what falls back on the senders."""
         tracer = HemisphereTracer(self.scene, self.samples, self.hemisphere, self.channels, self.lanes)
-        labels = np.repeat(np.arange(len(self.clusters)), np.diff(self.samples.starts)).astype(np.int32)
+        labels = self.samples.labels
         count = self._flat_sizes(senders)
         self.rays = len(self.points) * len(self.hemisphere)
         started, traced, parts = time.perf_counter(), 0, []
@@ -264,7 +264,7 @@ class MeshlessPrecomputation:
         matrix, ranks, error = within_budget(matrix, examples, settings.transfer_error)
         rank = max(int(ranks.max()), 1)
         receivers = np.concatenate([part["receivers"][:, :rank] for part in parts])
-        receivers *= np.arange(rank) < np.repeat(ranks, np.diff(self.samples.starts))[:, None]
+        receivers *= np.arange(rank) < ranks[self.samples.labels][:, None]
         matrix = np.ascontiguousarray(matrix[:, :rank])
         self.progress("reflections", 1, 1, "")
         report = {
@@ -296,8 +296,7 @@ class MeshlessPrecomputation:
 
     def _visibility(self, depth):
         """How often the depth buffers are wrong of whether a light is visible, and what direct irradiance is off, under some examples."""
-        rotations = np.concatenate([cluster_frames(self.points.normals[cluster]) for cluster in self.clusters])
-        direct = LocalDirect(self.samples, depth, rotations)
+        direct = LocalDirect(self.samples, depth)
         places = self.places[:: max(1, len(self.places) // VISIBILITY_LIGHTS)][:VISIBILITY_LIGHTS]
         truth = np.concatenate([values for _, values in trace_examples(self.scene, self.points, places, self.lanes)])
         wrong = facing = 0

@@ -2,7 +2,9 @@
 
 from pathlib import Path
 
-from . import asset_file, container, meshless_file
+from . import asset_file
+from . import container
+from . import meshless_file
 from .asset import Asset
 from .meshless_asset import MeshlessAsset
 

@@ -2,15 +2,15 @@
 
 import numpy as np
 
-from .basis.bases import coefficient_bytes, fit_bytes
-from .basis.total import PROBES
-from .errors import SettingsError
-from .indirect import GREY, MOST_RAYS
-from .memory import resident_bytes
-from .parallel import BLOCK_ROWS
-from .runtime import thread_count
-from .transport.direct import LANES
-from .transport.interreflection import COLUMNS
+from ..basis.bases import coefficient_bytes, fit_bytes
+from ..basis.total import PROBES
+from ..errors import SettingsError
+from .reflections import GREY, MOST_RAYS
+from ..system.memory import resident_bytes
+from ..system.parallel import BLOCK_ROWS
+from ..system.runtime import thread_count
+from ..transport.direct import LANES
+from ..transport.interreflection import COLUMNS
 
 LANE_BYTES = 40  # of a wavefront, for each of its rays
 LEAST_LANES = 1 << 16

@@ -6,8 +6,8 @@ import os
 from contextlib import contextmanager
 from pathlib import Path
 
-from .errors import AssetError
-from .files import replacing
+from ..errors import AssetError
+from ..system.files import replacing
 
 FORMAT = "mi_prt asset"
 VERSIONS = {"distant": 3, "local": 4}  # format version of each kind of transport

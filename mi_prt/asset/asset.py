@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from . import asset_file
-from .lighting.environment import LightWarning
-from .lighting.light import as_light
-from .lighting.local import arrival, hull_warning, refuse_all_but_point_lights
-from .parallel import BLOCK_ROWS, map_chunks, one_blas_thread
-from .points.interpolate import PatchInterpolator
-from .points.points import Points
+from ..lighting.environment import LightWarning
+from ..lighting.light import as_light
+from ..lighting.local import arrival, hull_warning, refuse_all_but_point_lights
+from ..system.parallel import BLOCK_ROWS, map_chunks, one_blas_thread
+from ..points.interpolate import PatchInterpolator
+from ..points.points import Points
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,12 +9,12 @@ import numpy as np
 import scipy.sparse
 
 from . import container
-from .basis.bases import BASES
-from .basis.haar import row_ends
-from .directions import parse_directions
-from .points.lattice import Patches, node_count
-from .points.points import POINT_FIELDS, Points
-from .transport.direct import DirectTransport
+from ..basis.bases import BASES
+from ..basis.haar import row_ends
+from ..directions import parse_directions
+from ..points.lattice import Patches, node_count
+from ..points.points import POINT_FIELDS, Points
+from ..transport.direct import DirectTransport
 
 UNITS = {
     "points/positions": "m",

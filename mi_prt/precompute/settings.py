@@ -4,11 +4,11 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from .basis.bases import check_basis, check_components, default_components, most_components
-from .basis.target import Target
-from .directions import parse_directions
-from .directions.hemisphere import Hemisphere
-from .errors import SettingsError
+from ..basis.bases import check_basis, check_components, default_components, most_components
+from ..basis.target import Target
+from ..directions import parse_directions
+from ..directions.hemisphere import Hemisphere
+from ..errors import SettingsError
 
 DEFAULT_VARIANCE = 0.95
 MAX_RAYS_PER_DIRECTION = 64

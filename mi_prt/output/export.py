@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import SettingsError
-from ..files import replacing
-from ..runtime import mitsuba
-from .display import display, exposure
+from ..system.files import replacing
+from ..system.runtime import mitsuba
+from ..render.display import display, exposure
 
 PLY_TYPES = {"<f4": "float", "|u1": "uchar"}
 

@@ -4,19 +4,19 @@ import time
 import warnings
 from pathlib import Path
 
-from .errors import SceneError, SettingsError
-from .evaluate.local_lights import measure_error
-from .files import check_writable
-from .lighting.environment import LightWarning
-from .lighting.local import hull_warning
-from .lighting.scene_light import is_of_scene, lit_scene, turned_light
-from .meshless_asset import MeshlessAsset
-from .provenance import open_scene_of
+from ..errors import SceneError, SettingsError
+from ..evaluate.local_lights import measure_error
+from ..system.files import check_writable
+from ..lighting.environment import LightWarning
+from ..lighting.local import hull_warning
+from ..lighting.scene_light import is_of_scene, lit_scene, turned_light
+from ..asset.meshless_asset import MeshlessAsset
+from ..asset.provenance import open_scene_of
 from .relight_local import IMAGES, MESHES, relight_local
-from .render.display import exposure
-from .render.export import write_image, write_npz, write_ply
-from .render.image import pick_sensor, render_image, resized
-from .scene.scene import Scene
+from ..render.display import exposure
+from .export import write_image, write_npz, write_ply
+from ..render.image import pick_sensor, render_image, resized
+from ..scene.scene import Scene
 
 RENDERERS = ("mitsuba", "raster")
 
@@ -98,7 +98,7 @@ def relight_to_file(
     opened = open_scene_of(asset, scene) if needs_scene else None
     shown, chosen = turned_light(opened, light, rotate)
     if renderer == "raster":
-        from .render.raster import RasterScene  # opens OpenGL: only where it is asked for
+        from ..render.raster import RasterScene  # opens OpenGL: only where it is asked for
 
     clock = [time.perf_counter()]
     projected = asset.project_light(chosen)

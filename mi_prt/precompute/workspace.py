@@ -17,8 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
-from .errors import SettingsError
-from .files import check_writable
+from ..errors import SettingsError
+from ..system.files import check_writable
 
 SUFFIX = ".partial"
 _RUN = "run.json"

@@ -6,13 +6,13 @@ import numpy as np
 import scipy.sparse
 
 from . import container
-from .lighting.emission import Emission
-from .points.lattice import Patches
-from .points.points import POINT_FIELDS, Points
-from .points.samples import Samples
+from ..lighting.emission import Emission
+from ..points.lattice import Patches
+from ..points.points import POINT_FIELDS, Points
+from ..points.samples import Samples
 from .quantize import Quantized, cluster_scales, quantized, quantized_by_cluster
-from .transport.depth import DepthBuffers
-from .transport.transfer_matrix import Transfer
+from ..transport.depth import DepthBuffers
+from ..transport.transfer_matrix import Transfer
 
 UNITS = {
     "points/positions": "m",

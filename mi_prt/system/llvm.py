@@ -15,7 +15,7 @@ import sys
 from dataclasses import dataclass
 from glob import glob
 
-from .errors import RuntimeSetupError
+from ..errors import RuntimeSetupError
 
 VARIABLE = "DRJIT_LIBLLVM_PATH"
 

@@ -7,19 +7,19 @@ from pathlib import Path
 
 import numpy as np
 
-from .errors import LightError, SettingsError
-from .files import check_writable
-from .lighting.emission import emission_of
-from .lighting.light import Light, as_light
-from .lighting.scene_light import chosen_local_light, is_of_scene, lit_scene
-from .meshless_asset import COMPONENTS
-from .provenance import open_scene_of
-from .render.animation import check_frames_output, write_frames
-from .render.display import display, exposure
-from .render.export import write_image, write_npz, write_ply
-from .render.image import pick_sensor, render_image, resized
-from .render.integrator import DIRECT
-from .scene.scene import Scene
+from ..errors import LightError, SettingsError
+from ..system.files import check_writable
+from ..lighting.emission import emission_of
+from ..lighting.light import Light, as_light
+from ..lighting.scene_light import chosen_local_light, is_of_scene, lit_scene
+from ..asset.meshless_asset import COMPONENTS
+from ..asset.provenance import open_scene_of
+from .film import check_frames_output, write_frames
+from ..render.display import display, exposure
+from .export import write_image, write_npz, write_ply
+from ..render.image import pick_sensor, render_image, resized
+from ..render.integrator import DIRECT
+from ..scene.scene import Scene
 
 IMAGES = (".exr", ".png")
 MESHES = (".ply", ".npz")
@@ -193,7 +193,7 @@ class LocalPicture:
         """SplatScene of the samples."""
         if self._at_pixels:
             raise SettingsError("direct light at pixels needs the renderer mitsuba, splats show that of the points")
-        from .render.splats import SplatScene  # opens OpenGL: only where it is asked for
+        from ..render.splats import SplatScene  # opens OpenGL: only where it is asked for
 
         samples_of = self._asset.samples
         radii = np.full(len(samples_of), SPLAT_RADII * samples_of.radius, np.float32)

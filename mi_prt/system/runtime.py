@@ -16,7 +16,7 @@ from ctypes.util import find_library
 from functools import cache
 from types import ModuleType
 
-from .errors import RuntimeSetupError, SettingsError
+from ..errors import RuntimeSetupError, SettingsError
 from .llvm import install_command, require_llvm, select_llvm
 
 VARIANTS = ("cuda_ad_rgb", "llvm_ad_rgb")

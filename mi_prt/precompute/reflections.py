@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .transport.hops import NOTHING, Hops, HopSampler
-from .transport.interreflection import MOST_SUMMED_BOUNCES, BounceSplit, check_ending, combined, solve, split_by_bounces
-from .transport.paths import ENERGY_BINS, PathSampler
+from ..transport.hops import NOTHING, Hops, HopSampler
+from ..transport.interreflection import MOST_SUMMED_BOUNCES, BounceSplit, check_ending, combined, solve, split_by_bounces
+from ..transport.paths import ENERGY_BINS, PathSampler
 
 PILOT_POINTS = 256
 PILOT_RAYS = 64

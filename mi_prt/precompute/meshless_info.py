@@ -4,8 +4,8 @@ import time
 from dataclasses import asdict, replace
 
 from .meshless import MeshlessPrecomputation
-from .meshless_file import compressed
-from .provenance import left_out
+from ..asset.meshless_file import compressed
+from ..asset.provenance import left_out
 from .workspace import temporary
 
 FIRST_COUNT, PROBE_COUNT = 200, 3000  # samples of the runs that the cost is told from

@@ -3,10 +3,10 @@
 import warnings
 from pathlib import Path
 
-from .errors import SceneError
-from .lighting.environment import LightWarning
-from .points.tessellate import TESSELLATED_SHAPES
-from .scene.scene import open_scene
+from ..errors import SceneError
+from ..lighting.environment import LightWarning
+from ..points.tessellate import TESSELLATED_SHAPES
+from ..scene.scene import open_scene
 
 
 def describe_scene(scene, local_lights=False):

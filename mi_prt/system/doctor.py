@@ -14,7 +14,8 @@ from pathlib import Path
 
 from packaging.requirements import Requirement
 
-from . import llvm, runtime
+from . import llvm
+from . import runtime
 
 TIME_LIMIT = 120
 """Seconds after which a probe counts as failed."""
@@ -22,7 +23,7 @@ TIME_LIMIT = 120
 # The path integrator is what an unusable LLVM cannot compile.
 _RAYS_PROBE = """
 import json
-from mi_prt import runtime
+from mi_prt.system import runtime
 mi = runtime.mitsuba()
 import drjit as dr
 scene = mi.load_dict({"type": "scene", "integrator": {"type": "path"}, "light": {"type": "constant"},
@@ -37,7 +38,7 @@ print(json.dumps({"variant": mi.variant(), "distance": float(hit.t[0]), "threads
 
 _RASTER_PROBE = """
 import json
-from mi_prt import runtime
+from mi_prt.system import runtime
 pyrender = runtime.pyrender()
 renderer = pyrender.OffscreenRenderer(16, 16)
 from OpenGL.GL import GL_RENDERER, glGetString
@@ -119,7 +120,7 @@ def as_dict(checks: list[Check]) -> dict:
 
 def _probe(code: str) -> tuple[dict, str]:
     """Run code in another process: what it printed last, as JSON, and, if it failed, its complaint in one line."""
-    folder = str(Path(__file__).parents[1])
+    folder = str(Path(__file__).parents[2])
     path = os.pathsep.join(filter(None, [folder, os.environ.get("PYTHONPATH")]))
     try:
         run = subprocess.run([sys.executable, "-c", code], env=os.environ | {"PYTHONPATH": path}, capture_output=True,

@@ -5,24 +5,24 @@ from dataclasses import asdict
 
 import numpy as np
 
-from .asset_file import coefficient_arrays
-from .basis.bases import coefficient_bytes, fit_bytes
-from .directions import parse_directions
-from .indirect import surface_shares
-from .indirect import GREY
-from .memory import resident_bytes
-from .meshless_asset import MeshlessAsset
+from ..asset.asset_file import coefficient_arrays
+from ..basis.bases import coefficient_bytes, fit_bytes
+from ..directions import parse_directions
+from .reflections import surface_shares
+from .reflections import GREY
+from ..system.memory import resident_bytes
+from ..asset.meshless_asset import MeshlessAsset
 from .meshless_info import describe_meshless, describe_meshless_asset
-from .parallel import BLOCK_ROWS, map_chunks
-from .points.points import POINT_BUDGET, sample_points
-from .provenance import left_out
-from .room import LANE_BYTES, POINT_BYTES, expected_channels, held_coefficient_bytes
-from .scene.scene import open_scene
+from ..system.parallel import BLOCK_ROWS, map_chunks
+from ..points.points import POINT_BUDGET, sample_points
+from ..asset.provenance import left_out
+from .budget import LANE_BYTES, POINT_BYTES, expected_channels, held_coefficient_bytes
+from ..scene.scene import open_scene
 from .settings import DIRECT_ONLY, MeshlessSettings, Settings
-from .transport.direct import LANES, find_buried, sample_direct
-from .transport.hops import blocked_share
-from .transport.interreflection import BOUNCE_TOLERANCE
-from .transport.paths import PathSampler, energies
+from ..transport.direct import LANES, find_buried, sample_direct
+from ..transport.hops import blocked_share
+from ..transport.interreflection import BOUNCE_TOLERANCE
+from ..transport.paths import PathSampler, energies
 
 PROBE_POINTS = 256
 PROBE_BLOCKS = 32

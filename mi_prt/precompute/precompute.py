@@ -10,26 +10,26 @@ from pathlib import Path
 import numpy as np
 import scipy.sparse
 
-from .asset import Asset
-from .basis.bases import fit_basis
-from .basis.none import NoBasis
-from .basis.rows import Rows
-from .basis.target import Fit, Target, check_room
-from .basis.total import carrier, fit_total
-from .directions import parse_directions
-from .errors import SettingsError
-from .indirect import IndirectTransport, direct_report, surface_shares
-from .memory import free_bytes, parse_bytes, resident_bytes
+from ..asset.asset import Asset
+from ..basis.bases import fit_basis
+from ..basis.none import NoBasis
+from ..basis.rows import Rows
+from ..basis.target import Fit, Target, check_room
+from ..basis.total import carrier, fit_total
+from ..directions import parse_directions
+from ..errors import SettingsError
+from .reflections import IndirectTransport, direct_report, surface_shares
+from ..system.memory import free_bytes, parse_bytes, resident_bytes
 from .meshless import MeshlessPrecomputation
-from .parallel import BLOCK_ROWS, map_chunks
-from .points.points import POINT_FIELDS, sample_points
-from .provenance import describe_scene
-from .room import INDIRECT_LANE_BYTES, LANE_BYTES, Room, held_coefficient_bytes
-from .runtime import count_kernels, peak_memory_bytes, versions
-from .scene.scene import open_scene
+from ..system.parallel import BLOCK_ROWS, map_chunks
+from ..points.points import POINT_FIELDS, sample_points
+from ..asset.provenance import describe_scene
+from .budget import INDIRECT_LANE_BYTES, LANE_BYTES, Room, held_coefficient_bytes
+from ..system.runtime import count_kernels, peak_memory_bytes, versions
+from ..scene.scene import open_scene
 from .settings import MeshlessSettings, Settings, names_of
-from .transport.direct import DirectSampler, find_buried
-from .transport.hops import blocked_share
+from ..transport.direct import DirectSampler, find_buried
+from ..transport.hops import blocked_share
 from .workspace import durable, temporary
 
 STRICTER = 0.99  # margin of a second fit, for what is lost beside direct transport

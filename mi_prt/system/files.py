@@ -5,7 +5,7 @@ import tempfile
 from contextlib import contextmanager
 from pathlib import Path
 
-from .errors import SettingsError
+from ..errors import SettingsError
 
 
 def check_writable(path):

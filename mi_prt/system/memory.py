@@ -2,7 +2,7 @@
 
 import psutil
 
-from .errors import SettingsError
+from ..errors import SettingsError
 
 _UNITS = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
 # Where a control group says its limit, what it uses and what of that is cache, of version 2 and of version 1.

@@ -7,16 +7,15 @@ from pathlib import Path
 import numpy as np
 
 from . import meshless_file
-from .errors import LightError, SettingsError
-from .lighting.emission import Emission, emission_of
-from .lighting.light import as_light
-from .parallel import one_blas_thread
-from .points.interpolate import SampleInterpolator
-from .points.samples import Samples
-from .transport.depth import DepthBuffers
-from .transport.hemispheres import cluster_frames
-from .transport.local_direct import LocalDirect
-from .transport.transfer_matrix import Transfer
+from ..errors import LightError, SettingsError
+from ..lighting.emission import Emission, emission_of
+from ..lighting.light import as_light
+from ..system.parallel import one_blas_thread
+from ..points.interpolate import SampleInterpolator
+from ..points.samples import Samples
+from ..transport.depth import DepthBuffers
+from ..transport.local_direct import LocalDirect
+from ..transport.transfer_matrix import Transfer
 
 COMPONENTS = ("total", "direct", "indirect")
 
@@ -123,8 +122,7 @@ class MeshlessAsset:
 
     @cached_property
     def _direct(self):
-        rotations = np.concatenate([cluster_frames(self.points.normals[cluster]) for cluster in self.samples.clusters])
-        return LocalDirect(self.samples, self.depth, rotations)
+        return LocalDirect(self.samples, self.depth)
 
     @cached_property
     def _reflection(self):

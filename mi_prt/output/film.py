@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import SettingsError
-from ..files import check_writable, replacing
+from ..system.files import check_writable, replacing
 from .export import to_8bit, write_displayed
 
 VIDEOS = (".mp4", ".gif")
