@@ -1,4 +1,6 @@
-"""A page of measurements in docs/, made section by section; the benchmarks that write one share this."""
+"""A page of measurements in docs/, made section by section; the benchmarks that write one share
+this.
+"""
 
 import argparse
 import re
@@ -8,14 +10,15 @@ from pathlib import Path
 import matplotlib
 
 matplotlib.use("Agg")
-import matplotlib.pyplot as plt  # noqa: E402
+import matplotlib.pyplot as plt
 
 ROOT = Path(__file__).resolve().parent.parent
 ASSETS = ROOT.parent / "shared" / "assets"
 
 
 def write_page(description, head, sections, name):
-    """Run the sections that the command line names and write them into the page; the other ones stay as they are.
+    """Run the sections that the command line names and write them into the page; the other ones
+    stay as they are.
 
     Parameters
     ----------
@@ -28,7 +31,9 @@ def write_page(description, head, sections, name):
     name : str
         Of the page in docs/; its pictures go to a folder of that name.
     """
-    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--assets", type=Path, default=ASSETS)
     parser.add_argument("--output", type=Path, default=ROOT / "docs" / name)
     parser.add_argument("--only", default="", help=f"some of {', '.join(sections)}")
@@ -42,7 +47,9 @@ def write_page(description, head, sections, name):
     for section in chosen:
         started = time.perf_counter()
         texts[section] = "\n".join(sections[section](arguments.assets, pictures)).strip()
-        print(f"{texts[section]}\n\n({section}: {time.perf_counter() - started:.0f} s)\n", flush=True)
+        print(
+            f"{texts[section]}\n\n({section}: {time.perf_counter() - started:.0f} s)\n", flush=True
+        )
         page = [head] + [f"<!-- {key} -->\n{texts[key]}" for key in sections if key in texts]
         arguments.output.write_text("\n\n".join(page) + "\n")
 

@@ -1,4 +1,5 @@
-"""Speed as ratios measured in one run: sampling against raw rays, relighting, turning light, kernels compiled.
+"""Speed as ratios measured in one run: sampling against raw rays, relighting, turning light,
+kernels compiled.
 
 Usage: python benchmarks/speed.py [SCENE.xml] [--repeat 7]
 
@@ -15,15 +16,17 @@ import mi_prt
 from mi_prt.directions import parse_directions
 from mi_prt.lighting.scene_light import scene_light
 from mi_prt.points.points import sample_points
-from mi_prt.system.runtime import count_kernels, thread_count
 from mi_prt.scene.scene import open_scene
+from mi_prt.system.runtime import count_kernels, thread_count
 from mi_prt.transport import direct
 
 SCENE = Path(__file__).resolve().parent.parent / "scenes" / "teapot.xml"
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("scene", nargs="?", type=Path, default=SCENE)
     parser.add_argument("--repeat", type=int, default=7)
     arguments = parser.parse_args()
@@ -31,7 +34,9 @@ def main():
     scene = open_scene(arguments.scene)
     points = sample_points(scene)
     directions = parse_directions("cubemap:32")
-    print(f"{arguments.scene.name}: {len(points):,} points, {directions}, {thread_count()} threads\n")
+    print(
+        f"{arguments.scene.name}: {len(points):,} points, {directions}, {thread_count()} threads\n"
+    )
     print("| what | median | bound |\n|---|---:|---:|")
     sampling(scene, points, directions, arguments.repeat)
     kernels(scene, points, directions)
@@ -51,11 +56,18 @@ def sampling(scene, points, directions, repeat):
     collections = [], []
     for _ in range(repeat + 1):
         collections[0].append(_timed(lambda: list(tracer.stream(blocks))))
-        collections[1].append(_timed(lambda: [_finish(scene.occluders.ray_test(ray)) for ray in rays]))
-    sampled, raw = (np.array(times[1:]) for times in collections)  # the first run compiles the kernels
+        collections[1].append(
+            _timed(lambda: [_finish(scene.occluders.ray_test(ray)) for ray in rays])
+        )
+    # the first run compiles the kernels
+    sampled, raw = (np.array(times[1:]) for times in collections)
     rate = len(blocks) * size * tracer.lanes_per_point / np.median(sampled)
     _row("transport sampling, million rays/s", f"{rate / 1e6:.1f}", "")
-    _row("sampling rate / rate of ray_test alone, same rays", f"{np.median(raw / sampled):.2f}", "≥ 0.8")
+    _row(
+        "sampling rate / rate of ray_test alone, same rays",
+        f"{np.median(raw / sampled):.2f}",
+        "≥ 0.8",
+    )
 
 
 def kernels(scene, points, directions):
@@ -68,15 +80,28 @@ def kernels(scene, points, directions):
 
 
 def relighting(path, repeat):
-    """Relighting alone, and turning + projecting + relighting; of direct light, and of light that reflections colour."""
+    """Relighting alone, and turning + projecting + relighting; of direct light, and of light that
+    reflections colour.
+    """
     for bounces, bound in ((0, "≤ 2"), ("auto", "")):
-        asset = mi_prt.precompute.precompute(path, coefficients=48, bounces=bounces)
+        asset = mi_prt.precompute(path, coefficients=48, bounces=bounces)
         what = "direct light" if bounces == 0 else "with coloured reflections"
         light = asset.project_light(scene_light(open_scene(path)))
-        relit = [_timed(lambda: asset.outgoing_radiance(asset.irradiance_from(*light))) for _ in range(20 * repeat)]
+        relit = [
+            _timed(lambda: asset.outgoing_radiance(asset.irradiance_from(*light)))
+            for _ in range(20 * repeat)
+        ]
         copied = [_timed(asset.coefficients.copy) for _ in range(20 * repeat)]
-        _row(f"relight {len(asset.points):,} points, 48 coefficients, {what}, ms", f"{1e3 * np.median(relit):.2f}", bound)
-        _row("relight / copy of the coefficients (memory bandwidth)", f"{np.median(relit) / np.median(copied):.2f}", "")
+        _row(
+            f"relight {len(asset.points):,} points, 48 coefficients, {what}, ms",
+            f"{1e3 * np.median(relit):.2f}",
+            bound,
+        )
+        _row(
+            "relight / copy of the coefficients (memory bandwidth)",
+            f"{np.median(relit) / np.median(copied):.2f}",
+            "",
+        )
         _turning(asset, path, repeat)
 
 

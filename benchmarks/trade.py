@@ -1,10 +1,11 @@
-"""The trade that mi_prt offers on one scene: coefficients against error, file size, precompute and relight time.
+"""The trade that mi_prt offers on one scene: coefficients against error, file size, precompute and
+relight time.
 
 Usage: python benchmarks/trade.py [SCENE.xml] [--plot docs/trade.png]
 
-Prints a Markdown table and draws the plot. Errors are those of irradiance at 2,000 points under the scene's own light
-turned to four angles, reflections included, against Mitsuba's emitter sampling and path tracer, with the reference's noise
-taken out.
+Prints a Markdown table and draws the plot. Errors are those of irradiance at 2,000 points under the
+scene's own light turned to four angles, reflections included, against Mitsuba's emitter sampling
+and path tracer, with the reference's noise taken out.
 """
 
 import argparse
@@ -26,7 +27,9 @@ ANGLES = (0, 90, 180, 270)
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("scene", nargs="?", type=Path, default=ROOT / "scenes" / "still_life.xml")
     parser.add_argument("--plot", type=Path, default=ROOT / "docs" / "trade.png")
     arguments = parser.parse_args()
@@ -35,26 +38,41 @@ def main():
     lights = [scene_light(scene).rotated("y", angle) for angle in ANGLES]
     truths = chosen = None
     curves = {}
-    print("| directions | rays each | coefficients | file, MB | precompute, s | relight, ms | relative RMSE | bias |")
+    print(
+        "| directions | rays each | coefficients | file, MB | precompute, s | relight, ms |"
+        " relative RMSE | bias |"
+    )
     print("|---|---:|---:|---:|---:|---:|---:|---:|")
     for directions, rays in SETTINGS:
         for coefficients in COEFFICIENTS:
-            asset, cost = measure(scene, directions=directions, rays_per_direction=rays, coefficients=coefficients)
+            asset, cost = measure(
+                scene, directions=directions, rays_per_direction=rays, coefficients=coefficients
+            )
             if truths is None:
                 chosen = np.sort(np.random.default_rng(0).permutation(len(asset.points))[:2000])
                 at = asset.points.at(chosen)
-                truths = [irradiance(lit_scene(scene.mi_scene, light), at, 8192, 2048) for light in lights]
+                truths = [
+                    irradiance(lit_scene(scene.mi_scene, light), at, 8192, 2048) for light in lights
+                ]
             projected = [asset.project_light(light) for light in lights]
             results = np.stack([asset.irradiance_from(*light)[chosen] for light in projected])
             expected = np.stack([truth.mean for truth in truths])
-            noise = np.linalg.norm([truth.standard_error for truth in truths]) / np.linalg.norm(expected)
+            noise = np.linalg.norm([truth.standard_error for truth in truths]) / np.linalg.norm(
+                expected
+            )
             error = np.sqrt(max(metrics.relative_rmse(results, expected) ** 2 - noise**2, 0))
-            relight = np.median([_timed(lambda: asset.outgoing_radiance(asset.irradiance_from(*projected[0]))) for _ in range(50)])
+            relight = np.median(
+                [
+                    _timed(lambda: asset.outgoing_radiance(asset.irradiance_from(*projected[0])))
+                    for _ in range(50)
+                ]
+            )
             size = _file_size(asset)
             curves.setdefault((directions, rays), []).append((1e3 * relight, error, coefficients))
             print(
-                f"| {directions} | {rays} | {coefficients} | {size / 1e6:.1f} | {sum(cost['seconds'].values()):.1f} | "
-                f"{1e3 * relight:.2f} | {error:.4f} | {metrics.relative_bias(results, expected):+.4f} |",
+                f"| {directions} | {rays} | {coefficients} | {size / 1e6:.1f} |"
+                f" {sum(cost['seconds'].values()):.1f} | {1e3 * relight:.2f} | {error:.4f} |"
+                f" {metrics.relative_bias(results, expected):+.4f} |",
                 flush=True,
             )
     print(f"\n{len(asset.points):,} points; the reference's own noise is {noise:.4f}")
@@ -62,7 +80,9 @@ def main():
 
 
 def plot(curves, path):
-    """Relight time against error, a curve for each setting, labelled with the number of coefficients."""
+    """Relight time against error, a curve for each setting, labelled with the number of
+    coefficients.
+    """
     import matplotlib
 
     matplotlib.use("Agg")
@@ -71,9 +91,16 @@ def plot(curves, path):
     figure, axes = pyplot.subplots(figsize=(7, 4.2), layout="constrained")
     for (directions, rays), curve in curves.items():
         milliseconds, errors, counts = np.array(curve).T
-        axes.plot(milliseconds, 100 * errors, "o-", label=f"{directions}, {rays} ray{'s' * (rays > 1)} per direction")
+        axes.plot(
+            milliseconds,
+            100 * errors,
+            "o-",
+            label=f"{directions}, {rays} ray{'s' * (rays > 1)} per direction",
+        )
     for x, y, count in zip(milliseconds, 100 * errors, counts):
-        axes.annotate(f"{int(count)}", (x, y), textcoords="offset points", xytext=(4, 6), fontsize=8)
+        axes.annotate(
+            f"{int(count)}", (x, y), textcoords="offset points", xytext=(4, 6), fontsize=8
+        )
     axes.set(xscale="log", yscale="log", xlabel="time to relight all points, ms (2 cores)")
     axes.set_ylabel("relative RMSE of irradiance, %")
     axes.set_title("Number of coefficients (labels) against error and time", fontsize=10)

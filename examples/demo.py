@@ -1,4 +1,5 @@
-"""The main job on one scene: precompute, relight under a turning sky, draw in two ways, compare with Mitsuba; and a lamp that moves inside.
+"""The main job on one scene: precompute, relight under a turning sky, draw in two ways, compare
+with Mitsuba; and a lamp that moves inside.
 
 Usage: python examples/demo.py [--out out/demo] [--frames 24]
 """
@@ -11,8 +12,8 @@ from PIL import Image
 
 import mi_prt
 from mi_prt.lighting.scene_light import lit_scene, scene_light
-from mi_prt.output.relight_local import animate_local
 from mi_prt.output.film import light_path
+from mi_prt.output.relight_local import animate_local
 from mi_prt.render.display import display, exposure
 from mi_prt.render.image import render_image, resized
 from mi_prt.scene.scene import open_scene
@@ -25,19 +26,23 @@ FRAME_SIZE = (400, 300)
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, default=ROOT / "out" / "demo", help="folder for the results")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--out", type=Path, default=ROOT / "out" / "demo", help="folder for the results"
+    )
     parser.add_argument("--frames", type=int, default=24, help="frames of the turning sky")
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
     started = time.perf_counter()
 
     say(f"1. precompute the transport of {SCENE.name} (once)")
-    asset = mi_prt.precompute.precompute(SCENE, coefficients=128, rays_per_direction=4)
+    asset = mi_prt.precompute(SCENE, coefficients=128, rays_per_direction=4)
     asset.save(arguments.out / "still_life.prt")
     say(
-        f"   {len(asset.points):,} points, {asset.report['rays']:,} rays, {asset.report['bounces']} reflections, "
-        f"{asset.report['captured_variance']:.2%} of the variance"
+        f"   {len(asset.points):,} points, {asset.report['rays']:,} rays, {asset.report['bounces']}"
+        f" reflections, {asset.report['captured_variance']:.2%} of the variance"
     )
 
     say("2. turn the sky around it")
@@ -52,8 +57,9 @@ def main():
     report = mi_prt.compare(asset, arguments.out / "report", size=(640, 480), spp=256)
     errors = report["image"]
     say(
-        f"   image: relative RMSE {errors['relative_rmse']:.2%} (reference noise {errors['reference_noise']:.2%}), "
-        f"bias {errors['bias']:+.2%}, PSNR {errors['psnr']:.1f} dB, FLIP {errors['flip']:.3f}"
+        f"   image: relative RMSE {errors['relative_rmse']:.2%} (reference noise"
+        f" {errors['reference_noise']:.2%}), bias {errors['bias']:+.2%}, PSNR {errors['psnr']:.1f}"
+        f" dB, FLIP {errors['flip']:.3f}"
     )
     say(f"5. carry a lamp through the two rooms of {ROOM.name}")
     walk = arguments.out / "walk.gif"
@@ -87,18 +93,33 @@ def turning_sky(asset, path, frames):
             shown = display(render_image(asset, turned, sensor, spp=16), factor)
         pictures.append(Image.fromarray((shown * 255 + 0.5).astype("uint8")))
     pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=80, loop=0)
-    say(f"   turn, project and relight {len(asset.points):,} points: {1e3 * sorted(relighting)[frames // 2]:.1f} ms a frame")
+    say(
+        f"   turn, project and relight {len(asset.points):,} points:"
+        f" {1e3 * sorted(relighting)[frames // 2]:.1f} ms a frame"
+    )
 
 
 def carried_lamp(path, frames):
-    """Write an animation of a point light on its way from one room to the other, direct and reflected light."""
+    """Write an animation of a point light on its way from one room to the other, direct and
+    reflected light.
+    """
     begun = time.perf_counter()
-    asset = mi_prt.precompute.precompute(ROOM, points="samples", count=12_000, cluster_size=300, depth_directions=1024)
-    say(f"   {len(asset.points):,} samples, {len(asset.samples.roots)} clusters, {time.perf_counter() - begun:.1f} s")
+    asset = mi_prt.precompute(
+        ROOM, points="samples", count=12_000, cluster_size=300, depth_directions=1024
+    )
+    say(
+        f"   {len(asset.points):,} samples, {len(asset.samples.roots)} clusters,"
+        f" {time.perf_counter() - begun:.1f} s"
+    )
     way = light_path(WALK)
     lamp = mi_prt.PointLight(way.positions(1)[0], (3.2, 2.9, 2.5))
-    told = animate_local(asset, path, way, frames, fps=12, light=lamp, size=(480, 300), renderer="raster")
-    say(f"   direct light and all reflections: {1e3 * told['seconds']['relight'] / frames:.1f} ms a frame")
+    told = animate_local(
+        asset, path, way, frames, fps=12, light=lamp, size=(480, 300), renderer="raster"
+    )
+    say(
+        f"   direct light and all reflections: {1e3 * told['seconds']['relight'] / frames:.1f} ms a"
+        " frame"
+    )
 
 
 def say(text):

@@ -8,37 +8,57 @@ import time
 from pathlib import Path
 
 import mi_prt
-from mi_prt.output.relight_local import animate_local
 from mi_prt.output.film import light_path
+from mi_prt.output.relight_local import animate_local
 
 SCENE = Path(__file__).resolve().parent.parent / "scenes" / "room.xml"
-WALK = light_path("1.6,1.7,1.6 -0.6,1.7,1.5 0.1,1.6,0.2 0.1,1.6,-1.4 -1.6,1.7,-1.8 1.4,1.7,-2.0")  # through the doorway
+# through the doorway
+WALK = light_path("1.6,1.7,1.6 -0.6,1.7,1.5 0.1,1.6,0.2 0.1,1.6,-1.4 -1.6,1.7,-1.8 1.4,1.7,-2.0")
 INTENSITY = (3.2, 2.9, 2.5)  # W/sr
 SIZE = (480, 300)
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--count", type=int, default=20_000, help="samples")
     parser.add_argument("--frames", type=int, default=60)
-    parser.add_argument("--out", type=Path, default=Path("out/moving_light"), help="folder for the results")
+    parser.add_argument(
+        "--out", type=Path, default=Path("out/moving_light"), help="folder for the results"
+    )
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
 
     started = time.perf_counter()
-    asset = mi_prt.precompute.precompute(SCENE, points="samples", count=arguments.count, cluster_size=max(1, arguments.count // 45))
+    asset = mi_prt.precompute(
+        SCENE, points="samples", count=arguments.count, cluster_size=max(1, arguments.count // 45)
+    )
     asset.save(arguments.out / "room.prt")
-    print(f"{len(asset.points):,} samples in {len(asset.samples.roots)} clusters: {time.perf_counter() - started:.0f} s")
+    print(
+        f"{len(asset.points):,} samples in {len(asset.samples.roots)} clusters:"
+        f" {time.perf_counter() - started:.0f} s"
+    )
 
     lamp = mi_prt.PointLight(WALK.positions(1)[0], INTENSITY)
     film = arguments.out / "walk.mp4"
-    told = animate_local(asset, film, WALK, arguments.frames, light=lamp, size=SIZE, renderer="raster")
+    told = animate_local(
+        asset, film, WALK, arguments.frames, light=lamp, size=SIZE, renderer="raster"
+    )
     seconds = told["seconds"]
-    print(f"{film}: relight {1e3 * seconds['relight'] / arguments.frames:.1f} ms, draw {1e3 * seconds['render'] / arguments.frames:.0f} ms a frame")
+    print(
+        f"{film}: relight {1e3 * seconds['relight'] / arguments.frames:.1f} ms, draw"
+        f" {1e3 * seconds['render'] / arguments.frames:.0f} ms a frame"
+    )
 
-    report = mi_prt.compare(asset, arguments.out / "report", lamp, size=SIZE, spp=64, direct="pixels")
+    report = mi_prt.compare(
+        asset, arguments.out / "report", lamp, size=SIZE, spp=64, direct="pixels"
+    )
     for name, errors in (report["components"] | {"all": report["points"]}).items():
-        print(f"{name} light at the points: {errors['relative_rmse_beyond_noise']:.1%} off, bias {errors['bias']:+.1%}")
+        print(
+            f"{name} light at the points: {errors['relative_rmse_beyond_noise']:.1%} off, bias"
+            f" {errors['bias']:+.1%}"
+        )
 
 
 if __name__ == "__main__":

@@ -1,4 +1,6 @@
-"""The Python API on a scene dict: points, transport, irradiance and outgoing radiance as NumPy arrays."""
+"""The Python API on a scene dict: points, transport, irradiance and outgoing radiance as NumPy
+arrays.
+"""
 
 import numpy as np
 
@@ -6,16 +8,21 @@ import mi_prt
 
 scene = {
     "type": "scene",
-    "floor": {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.4, 0.5, 0.6]}}},
+    "floor": {
+        "type": "rectangle",
+        "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.4, 0.5, 0.6]}},
+    },
     "ball": {"type": "sphere", "center": [0, 0, 0.4], "radius": 0.3},
 }
-asset = mi_prt.precompute.precompute(scene, directions="cubemap:16", coefficients=32)
+asset = mi_prt.precompute(scene, directions="cubemap:16", coefficients=32)
 print(
-    f"{len(asset.points):,} points, {asset.directions}, captured variance {asset.report['captured_variance']:.3f}, "
-    f"{asset.report['bounces']} reflections: mean irradiance under a white sky {sum(asset.report['bounce_energy']):.3f} of π"
+    f"{len(asset.points):,} points, {asset.directions}, captured variance"
+    f" {asset.report['captured_variance']:.3f}, {asset.report['bounces']} reflections: mean"
+    f" irradiance under a white sky {sum(asset.report['bounce_energy']):.3f} of π"
 )
 
-# A map of any size: here a bright band of sky around the horizon (+y is up in a map; this scene has +z up).
+# A map of any size: here a bright band of sky around the horizon (+y is up in a map; this scene has
+# +z up).
 height, width = 64, 128
 pixels = np.full((height, width, 3), 0.05, np.float32)
 pixels[height // 4 : height // 2] = [1.0, 0.9, 0.7]
@@ -23,11 +30,13 @@ light = mi_prt.EnvironmentMap(pixels).rotated(axis="x", degrees=90)
 
 irradiance = asset.irradiance(light)  # (n, 3) W/m²
 radiance = asset.relight(light)  # (n, 3) W/(m²·sr)
-row = asset.transport([0])  # (1, 3, s), or (1, s) where all is grey: the first point's transport as the basis holds it
+# (1, 3, s), or (1, s) where all is grey: the first point's transport as the basis holds it
+row = asset.transport([0])
 print("mean irradiance", irradiance.mean(axis=0), "mean outgoing radiance", radiance.mean(axis=0))
 print("transport of point 0, integrated over the sphere:", row[0] @ asset.directions.solid_angles)
 
-# Several lights at once: a list is their sum. A local light is seen right from outside the scene's convex hull.
+# Several lights at once: a list is their sum. A local light is seen right from outside the scene's
+# convex hull.
 sun = mi_prt.DirectionalLight(direction=[1, 0, -2], irradiance=3.0)  # travels down, W/m²
 lamp = mi_prt.PointLight(position=[1.5, -1.0, 2.0], intensity=[8, 6, 4])  # W/sr
 print("sky, sun and lamp:", asset.irradiance([light, sun, lamp]).mean(axis=0))

@@ -8,13 +8,16 @@ from pathlib import Path
 
 import mi_prt
 
-scene = Path(sys.argv[1] if len(sys.argv) > 1 else Path(__file__).parent.parent / "scenes" / "still_life.xml")
+scene = Path(
+    sys.argv[1] if len(sys.argv) > 1 else Path(__file__).parent.parent / "scenes" / "still_life.xml"
+)
 folder = Path(sys.argv[2] if len(sys.argv) > 2 else "out/xml_to_image")
 folder.mkdir(parents=True, exist_ok=True)
 
-mi_prt.precompute.precompute(scene).save(folder / "scene.prt")
+mi_prt.precompute(scene).save(folder / "scene.prt")
 
-# The scene's own light, then the same light turned; EXR is linear radiance, PNG is exposed for a display.
+# The scene's own light, then the same light turned; EXR is linear radiance, PNG is exposed for a
+# display.
 asset = mi_prt.load(folder / "scene.prt")
 mi_prt.relight_to_file(asset, folder / "own_light.exr")
 mi_prt.relight_to_file(asset, folder / "own_light.png")

@@ -1,4 +1,7 @@
-"""Typed errors. Every message gives the offending value, the limit it broke and the remedy, in one line."""
+"""Typed errors.
+
+Every message gives the offending value, the limit it broke and the remedy, in one line.
+"""
 
 
 class PrtError(Exception):
@@ -8,7 +11,9 @@ class PrtError(Exception):
 
 
 class RuntimeSetupError(PrtError):
-    """The machine lacks something mi_prt needs: a usable LLVM, an OpenGL platform, a Mitsuba variant."""
+    """The machine lacks something mi_prt needs: a usable LLVM, an OpenGL platform, a Mitsuba
+    variant.
+    """
 
 
 class InputError(PrtError, ValueError):
@@ -22,7 +27,9 @@ class SceneError(InputError):
 
 
 class LightError(InputError):
-    """Lighting that is missing, unreadable or physically meaningless (NaN, Inf, negative energy)."""
+    """Lighting that is missing, unreadable or physically meaningless (NaN, Inf, negative
+    energy).
+    """
 
 
 class AssetError(InputError):

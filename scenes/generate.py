@@ -1,12 +1,14 @@
 #!/usr/bin/env python3
-"""Regenerate every generated file of this folder: the PLY meshes, EXR environment maps and PNG textures.
+"""Regenerate every generated file of this folder: the PLY meshes, EXR environment maps and PNG
+textures.
 
     python scenes/generate.py [--out DIR]
 
-The output is deterministic: a second run writes the same bytes. Meshes are y-up, in scene units, with
-counter-clockwise faces seen from outside. Numbers are rounded before they are stored, so that the last bit of a
-sine or a root, which differs between machines, does not reach the files. PNG and EXR are compressed by zlib and
-OpenEXR: another version of those may pack the very same pixels into other bytes.
+The output is deterministic: a second run writes the same bytes. Meshes are y-up, in scene units,
+with counter-clockwise faces seen from outside. Numbers are rounded before they are stored, so that
+the last bit of a sine or a root, which differs between machines, does not reach the files. PNG and
+EXR are compressed by zlib and OpenEXR: another version of those may pack the very same pixels into
+other bytes.
 """
 
 from __future__ import annotations
@@ -25,7 +27,8 @@ TEAPOT_DIVISIONS = 14  # quads along each edge of each of the 32 patches
 ENVMAP_SIZE = (128, 256)  # rows, columns
 TEXTURE_SIZE = 512  # pixels, both ways
 
-# Each teapot patch fills a band of the texture's v: (v of the patch's first row, v of its last row). Neighbours meet.
+# Each teapot patch fills a band of the texture's v: (v of the patch's first row, v of its last
+# row). Neighbours meet.
 TEAPOT_BANDS = {
     "bottom": (0.00, 0.15),
     "body_lower": (0.30, 0.15),
@@ -38,7 +41,8 @@ TEAPOT_BANDS = {
     "spout_root": (0.90, 0.95),
     "spout_tip": (0.95, 1.00),
 }
-# Patches of one part are welded together; the parts are separate surfaces that only touch or intersect.
+# Patches of one part are welded together; the parts are separate surfaces that only touch or
+# intersect.
 TEAPOT_PARTS = {
     "pot": ("bottom", "body_lower", "body_upper", "rim"),
     "lid": ("lid_cover", "lid_knob"),
@@ -52,7 +56,8 @@ PART_OF_PATCH = {patch: part for part, patches in TEAPOT_PARTS.items() for patch
 
 
 def read_patches(path: Path = PATCH_FILE) -> list[tuple[str, str, np.ndarray]]:
-    """Read the published patches: (name, mirror, control points of shape (4, 4, 3), indexed [v, u, xyz], z up).
+    """Read the published patches: (name, mirror, control points of shape (4, 4, 3), indexed [v, u,
+    xyz], z up).
 
     mirror is "xy" or "y": the axes that the patch is reflected along to complete the teapot.
     """
@@ -65,19 +70,24 @@ def read_patches(path: Path = PATCH_FILE) -> list[tuple[str, str, np.ndarray]]:
 
 
 def teapot_nets(path: Path = PATCH_FILE) -> list[tuple[str, bool, np.ndarray]]:
-    """All 32 patches as (name, reflected in y?, net of shape (4, 4, 3)), z up, each with dP/du x dP/dv outwards."""
+    """All 32 patches as (name, reflected in y?, net of shape (4, 4, 3)), z up, each with dP/du x
+    dP/dv outwards.
+    """
     nets = []
     for name, mirror, net in read_patches(path):
         for flip_x in (False, True) if "x" in mirror else (False,):
             for flip_y in (False, True):
                 copy = net * [-1.0 if flip_x else 1.0, -1.0 if flip_y else 1.0, 1.0]
-                # One reflection turns the surface inside out; running u backwards turns it outside again.
+                # One reflection turns the surface inside out; running u backwards turns it outside
+                # again.
                 nets.append((name, flip_y, copy[:, ::-1] if flip_x != flip_y else copy))
     return nets
 
 
 def bernstein(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The four cubic Bernstein polynomials at t of shape (n,), and their derivatives: two arrays of shape (n, 4)."""
+    """The four cubic Bernstein polynomials at t of shape (n,), and their derivatives: two arrays of
+    shape (n, 4).
+    """
     s = 1.0 - t
     value = np.stack([s * s * s, 3 * s * s * t, 3 * s * t * t, t * t * t], axis=1)
     slope = np.stack([-3 * s * s, 3 * s * s - 6 * s * t, 6 * s * t - 3 * t * t, 3 * t * t], axis=1)
@@ -85,16 +95,21 @@ def bernstein(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def evaluate_patch(net: np.ndarray, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points and exact unit normals of a bicubic patch on the grid v x u: two arrays of shape (len(v), len(u), 3).
+    """Points and exact unit normals of a bicubic patch on the grid v x u: two arrays of shape
+    (len(v), len(u), 3).
 
-    Where a row of the net collapses to a point (the tip of the lid, the centre of the bottom), dP/du vanishes. Near
-    that row dP/du = v * d2P/dudv + ..., so the mixed derivative gives the limit of its direction, hence the normal.
+    Where a row of the net collapses to a point (the tip of the lid, the centre of the bottom),
+    dP/du vanishes. Near that row dP/du = v * d2P/dudv + ..., so the mixed derivative gives the
+    limit of its direction, hence the normal.
     """
 
     def combine(along_v: np.ndarray, along_u: np.ndarray) -> np.ndarray:
-        # Plain sums in a fixed order: the same bits everywhere, which a matrix product does not promise.
+        # Plain sums in a fixed order: the same bits everywhere, which a matrix product does not
+        # promise.
         return sum(
-            along_v[:, None, i, None] * along_u[None, :, j, None] * net[i, j] for i in range(4) for j in range(4)
+            along_v[:, None, i, None] * along_u[None, :, j, None] * net[i, j]
+            for i in range(4)
+            for j in range(4)
         )
 
     bu, du = bernstein(u)
@@ -109,30 +124,40 @@ def evaluate_patch(net: np.ndarray, u: np.ndarray, v: np.ndarray) -> tuple[np.nd
 
 
 def grid_faces(rows: int, columns: int) -> np.ndarray:
-    """Quads of a grid of rows x columns vertices, corners in the order (v, u), (v, u+), (v+, u+), (v+, u)."""
+    """Quads of a grid of rows x columns vertices, corners in the order (v, u), (v, u+), (v+, u+),
+    (v+, u).
+    """
     index = np.arange(rows * columns).reshape(rows, columns)
-    return np.stack([index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]], axis=-1).reshape(-1, 4)
+    return np.stack(
+        [index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]], axis=-1
+    ).reshape(-1, 4)
 
 
 def split_quads(quads: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """Triangles (m, 3) of quads (n, 4), cut along the shorter diagonal, without those that collapsed to a line."""
+    """Triangles (m, 3) of quads (n, 4), cut along the shorter diagonal, without those that
+    collapsed to a line.
+    """
     a, b, c, d = quads.T
     ac = np.sum((position[c] - position[a]) ** 2, axis=1)
     bd = np.sum((position[d] - position[b]) ** 2, axis=1)
     first = np.where((ac <= bd + 1e-9)[:, None], np.stack([a, b, c], 1), np.stack([a, b, d], 1))
     second = np.where((ac <= bd + 1e-9)[:, None], np.stack([a, c, d], 1), np.stack([b, c, d], 1))
     faces = np.stack([first, second], axis=1).reshape(-1, 3)
-    distinct = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    distinct = (
+        (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    )
     return faces[distinct]
 
 
 def teapot(divisions: int = TEAPOT_DIVISIONS) -> tuple[np.ndarray, np.ndarray]:
-    """The Utah teapot: vertices (n, 8) = x y z nx ny nz u v, and faces (m, 3). y up, standing on y = 0, spout to +x.
+    """The Utah teapot: vertices (n, 8) = x y z nx ny nz u v, and faces (m, 3). y up, standing on y
+    = 0, spout to +x.
 
-    Source: Martin Newell's 32 bicubic patches, at their published size (height 3.15, radius 2, 6.5 from handle to
-    spout). Closed below; open where the original is: at the rim (the lid lies loose), inside the spout's mouth, and
-    at the roots of spout and handle, hidden in the body. Vertices are shared across patches of a part wherever
-    position and normal agree. For that the texture repeats mirrored on the two sides of the handle-spout plane.
+    Source: Martin Newell's 32 bicubic patches, at their published size (height 3.15, radius 2, 6.5
+    from handle to spout). Closed below; open where the original is: at the rim (the lid lies
+    loose), inside the spout's mouth, and at the roots of spout and handle, hidden in the body.
+    Vertices are shared across patches of a part wherever position and normal agree. For that the
+    texture repeats mirrored on the two sides of the handle-spout plane.
     """
     t = np.arange(divisions + 1) / divisions
     cell = grid_faces(divisions + 1, divisions + 1)
@@ -141,7 +166,8 @@ def teapot(divisions: int = TEAPOT_DIVISIONS) -> tuple[np.ndarray, np.ndarray]:
     for name, flip_y, net in teapot_nets():
         p, n = (a.reshape(-1, 3) for a in evaluate_patch(net, t, t))
         v, u = (a.ravel() for a in np.meshgrid(t, t, indexing="ij"))
-        if PART_OF_PATCH[name] in ("pot", "lid"):  # surfaces round the z axis: u is the angle from the spout
+        # surfaces round the z axis: u is the angle from the spout
+        if PART_OF_PATCH[name] in ("pot", "lid"):
             on_axis = np.hypot(p[:, 0], p[:, 1]) < 1e-9
             u = np.where(on_axis, 0.5, np.arctan2(np.abs(p[:, 1]), p[:, 0]) / np.pi)
         elif flip_y:  # tubes: u runs round the half cross-section
@@ -159,39 +185,61 @@ def teapot(divisions: int = TEAPOT_DIVISIONS) -> tuple[np.ndarray, np.ndarray]:
     return vertex, split_quads(np.concatenate(quads), vertex[:, :3])
 
 
-def torus(major: float = 1.0, minor: float = 0.38, around: int = 56, across: int = 28) -> tuple[np.ndarray, np.ndarray]:
-    """A torus lying in the xz plane round the y axis: vertices (n, 8) = x y z nx ny nz u v, and faces (m, 3).
+def torus(
+    major: float = 1.0, minor: float = 0.38, around: int = 56, across: int = 28
+) -> tuple[np.ndarray, np.ndarray]:
+    """A torus lying in the xz plane round the y axis: vertices (n, 8) = x y z nx ny nz u v, and
+    faces (m, 3).
 
-    Radii in scene units. As in most textured meshes, u and v run from 0 to 1 once round, so the vertices on the two
-    texture seams exist twice, with equal positions and normals.
+    Radii in scene units. As in most textured meshes, u and v run from 0 to 1 once round, so the
+    vertices on the two texture seams exist twice, with equal positions and normals.
     """
-    grid = np.meshgrid(np.arange(across + 1) / across, np.arange(around + 1) / around, indexing="ij")
+    grid = np.meshgrid(
+        np.arange(across + 1) / across, np.arange(around + 1) / around, indexing="ij"
+    )
     v, u = (a.ravel() for a in grid)
     ring, tube = 2 * np.pi * (u % 1.0), 2 * np.pi * (v % 1.0)
-    normal = np.column_stack([np.cos(tube) * np.cos(ring), np.sin(tube), np.cos(tube) * np.sin(ring)])
+    normal = np.column_stack(
+        [np.cos(tube) * np.cos(ring), np.sin(tube), np.cos(tube) * np.sin(ring)]
+    )
     centre = major * np.column_stack([np.cos(ring), np.zeros_like(ring), np.sin(ring)])
     vertex = np.round(np.column_stack([centre + minor * normal, normal, u, v]), 7) + 0.0
     return vertex, split_quads(grid_faces(across + 1, around + 1)[:, ::-1], vertex[:, :3])
 
 
 def write_ply(path: Path, vertex: np.ndarray, face: np.ndarray, comment: str) -> None:
-    """Write a binary little-endian PLY: float32 x y z nx ny nz u v, and triangles as uchar + 3 int32."""
-    header = ["ply", "format binary_little_endian 1.0", f"comment {comment}", f"element vertex {len(vertex)}"]
+    """Write a binary little-endian PLY: float32 x y z nx ny nz u v, and triangles as uchar + 3
+    int32.
+    """
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"comment {comment}",
+        f"element vertex {len(vertex)}",
+    ]
     header += [f"property float {name}" for name in ("x", "y", "z", "nx", "ny", "nz", "u", "v")]
-    header += [f"element face {len(face)}", "property list uchar int vertex_indices", "end_header", ""]
+    header += [
+        f"element face {len(face)}",
+        "property list uchar int vertex_indices",
+        "end_header",
+        "",
+    ]
     packed = np.zeros(len(face), dtype=[("count", "u1"), ("index", "<i4", 3)])
     packed["count"], packed["index"] = 3, face
-    path.write_bytes("\n".join(header).encode("ascii") + vertex.astype("<f4").tobytes() + packed.tobytes())
+    path.write_bytes(
+        "\n".join(header).encode("ascii") + vertex.astype("<f4").tobytes() + packed.tobytes()
+    )
 
 
 # --------------------------------------------------------------------------------------------------- environment maps
 
 
 def latlong_directions(rows: int, columns: int) -> np.ndarray:
-    """World direction of each pixel, shape (rows, columns, 3), in the layout of Mitsuba's envmap emitter, y up.
+    """World direction of each pixel, shape (rows, columns, 3), in the layout of Mitsuba's envmap
+    emitter, y up.
 
-    Columns are cells: from -z at the left edge over +x, +z (the middle) and -x back to -z. Rows are nodes: Mitsuba
-    puts the first row exactly on the +y pole and the last on the -y pole.
+    Columns are cells: from -z at the left edge over +x, +z (the middle) and -x back to -z. Rows are
+    nodes: Mitsuba puts the first row exactly on the +y pole and the last on the -y pole.
     """
     phi = 2 * np.pi * (np.arange(columns) + 0.5)[None, :] / columns
     theta = np.pi * np.arange(rows)[:, None] / (rows - 1)
@@ -214,11 +262,13 @@ def sky(
     sun: tuple[float, float, float],
     sun_width: float,
 ) -> np.ndarray:
-    """A clear sky over a plain ground with a small soft sun towards +x: linear RGB, shape (rows, columns, 3).
+    """A clear sky over a plain ground with a small soft sun towards +x: linear RGB, shape (rows,
+    columns, 3).
 
-    Colours are radiances (unitless, as Mitsuba's RGB mode has them). elevation: of the sun, degrees. sun is the
-    radiance at its centre and sun_width the standard deviation of its Gaussian disc, in degrees; its irradiance at
-    normal incidence is about sun * 2 pi * radians(sun_width)^2. glow is the brightening of the sky around the sun.
+    Colours are radiances (unitless, as Mitsuba's RGB mode has them). elevation: of the sun,
+    degrees. sun is the radiance at its centre and sun_width the standard deviation of its Gaussian
+    disc, in degrees; its irradiance at normal incidence is about sun * 2 pi * radians(sun_width)^2.
+    glow is the brightening of the sky around the sun.
     """
     direction = latlong_directions(*ENVMAP_SIZE)
     height = direction[..., 1:2]
@@ -260,7 +310,9 @@ def sky_evening() -> np.ndarray:
 
 
 def write_exr(path: Path, image: np.ndarray) -> None:
-    """Write linear RGB of shape (rows, columns, 3) as a half-float OpenEXR file with ZIP compression."""
+    """Write linear RGB of shape (rows, columns, 3) as a half-float OpenEXR file with ZIP
+    compression.
+    """
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     with OpenEXR.File(header, {"RGB": np.ascontiguousarray(image.astype(np.float16))}) as file:
         file.write(str(path))
@@ -269,8 +321,12 @@ def write_exr(path: Path, image: np.ndarray) -> None:
 # ------------------------------------------------------------------------------------------------------------ textures
 
 
-def value_noise(random: np.random.RandomState, rows: int, columns: int, size: int = TEXTURE_SIZE) -> np.ndarray:
-    """Tileable smooth noise in 0..1, shape (size, size), from a lattice of rows x columns random values."""
+def value_noise(
+    random: np.random.RandomState, rows: int, columns: int, size: int = TEXTURE_SIZE
+) -> np.ndarray:
+    """Tileable smooth noise in 0..1, shape (size, size), from a lattice of rows x columns random
+    values.
+    """
     lattice = random.uniform(size=(rows, columns))
 
     def axis(cells: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -287,8 +343,13 @@ def value_noise(random: np.random.RandomState, rows: int, columns: int, size: in
 
 def planks(boards: int = 8, seed: int = 1975) -> np.ndarray:
     """A tileable floor of wooden boards along x: linear albedo in 0.1..0.8, shape (512, 512, 3)."""
-    random = np.random.RandomState(seed)  # this generator's stream is frozen by NumPy's compatibility policy
-    grain = 0.5 * value_noise(random, 128, 6) + 0.3 * value_noise(random, 64, 4) + 0.2 * value_noise(random, 256, 24)
+    # this generator's stream is frozen by NumPy's compatibility policy
+    random = np.random.RandomState(seed)
+    grain = (
+        0.5 * value_noise(random, 128, 6)
+        + 0.3 * value_noise(random, 64, 4)
+        + 0.2 * value_noise(random, 256, 24)
+    )
     y, x = np.meshgrid(np.arange(TEXTURE_SIZE), np.arange(TEXTURE_SIZE), indexing="ij")
     width, length = TEXTURE_SIZE // boards, TEXTURE_SIZE // 2
     row = y // width
@@ -308,14 +369,20 @@ def planks(boards: int = 8, seed: int = 1975) -> np.ndarray:
 def write_png(path: Path, albedo: np.ndarray) -> None:
     """Write linear RGB in 0..1 of shape (rows, columns, 3) as an 8-bit sRGB PNG."""
     curve = np.where(albedo <= 0.0031308, 12.92 * albedo, 1.055 * albedo ** (1 / 2.4) - 0.055)
-    Image.fromarray(np.round(np.round(curve, 9) * 255).astype(np.uint8)).save(path, compress_level=9)
+    Image.fromarray(np.round(np.round(curve, 9) * 255).astype(np.uint8)).save(
+        path, compress_level=9
+    )
 
 
 def generate(out: Path = HERE) -> list[Path]:
     """Write every generated file under out, creating its folders; returns their paths."""
     (out / "meshes").mkdir(parents=True, exist_ok=True)
     (out / "textures").mkdir(exist_ok=True)
-    write_ply(out / "meshes/teapot.ply", *teapot(), "Utah teapot, tessellated from the Bezier patches of M. Newell")
+    write_ply(
+        out / "meshes/teapot.ply",
+        *teapot(),
+        "Utah teapot, tessellated from the Bezier patches of M. Newell",
+    )
     write_ply(out / "meshes/torus.ply", *torus(), "torus")
     write_exr(out / "textures/sky_noon.exr", sky_noon())
     write_exr(out / "textures/sky_evening.exr", sky_evening())
@@ -324,8 +391,12 @@ def generate(out: Path = HERE) -> list[Path]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Regenerate the meshes, environment maps and textures of the scenes.")
-    parser.add_argument("--out", type=Path, default=HERE, help="folder to write to (default: beside this script)")
+    parser = argparse.ArgumentParser(
+        description="Regenerate the meshes, environment maps and textures of the scenes."
+    )
+    parser.add_argument(
+        "--out", type=Path, default=HERE, help="folder to write to (default: beside this script)"
+    )
     for path in generate(parser.parse_args().out):
         print(f"{path.stat().st_size:>8} bytes  {path}")
 

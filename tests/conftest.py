@@ -1,4 +1,7 @@
-"""Small scenes and independent integrators that several test files share. Scenes are y-up, lengths in metres."""
+"""Small scenes and independent integrators that several test files share.
+
+Scenes are y-up, lengths in metres.
+"""
 
 from dataclasses import dataclass
 
@@ -7,8 +10,8 @@ import scipy.stats
 
 from mi_prt.directions import parse_directions
 from mi_prt.points.points import sample_points
-from mi_prt.system.runtime import mitsuba
 from mi_prt.scene.scene import open_scene
+from mi_prt.system.runtime import mitsuba
 from mi_prt.transport.direct import find_buried, sample_direct
 from mi_prt.transport.hops import NOTHING, Hops, HopSampler, blocked_share
 from mi_prt.transport.interreflection import solve, split_by_bounces
@@ -16,12 +19,18 @@ from mi_prt.transport.paths import PathSampler
 
 
 def facing(normal, position=(0, 0, 0), size=1.0):
-    """`to_world` that takes Mitsuba's unit rectangle or disk (facing +z) to a place, facing `normal`."""
+    """`to_world` that takes Mitsuba's unit rectangle or disk (facing +z) to a place, facing
+    `normal`.
+    """
     transform = mitsuba().ScalarTransform4f
     normal = np.asarray(normal, float) / np.linalg.norm(normal)
     up = [1, 0, 0] if abs(normal[0]) < 0.9 else [0, 0, 1]
     target = np.asarray(position, float) + normal
-    return transform().look_at(origin=list(map(float, position)), target=list(map(float, target)), up=up).scale(float(size))
+    return (
+        transform()
+        .look_at(origin=list(map(float, position)), target=list(map(float, target)), up=up)
+        .scale(float(size))
+    )
 
 
 def diffuse(reflectance=0.5):
@@ -46,7 +55,11 @@ def sphere(position=(0, 0, 0), radius=1.0, **rest):
 def cube(position=(0, 0, 0), size=1.0, **rest):
     """An axis-aligned cube of half side `size`."""
     transform = mitsuba().ScalarTransform4f
-    return {"type": "cube", "to_world": transform().translate(list(map(float, position))).scale(float(size)), **rest}
+    return {
+        "type": "cube",
+        "to_world": transform().translate(list(map(float, position))).scale(float(size)),
+        **rest,
+    }
 
 
 def scene(**parts):
@@ -59,13 +72,17 @@ def uniform_sky(radiance=1.0):
 
 
 def sky_of(function, height=128):
-    """Map (h, 2h, 3) of a function of unit directions (k, 3), at Mitsuba's pixel centres; written anew from its manual.
+    """Map (h, 2h, 3) of a function of unit directions (k, 3), at Mitsuba's pixel centres; written
+    anew from its manual.
 
-    Mitsuba: u = (column + ½)/w and v = row/(h − 1) look along (sin 2πu sin πv, cos πv, −cos 2πu sin πv).
+    Mitsuba: u = (column + ½)/w and v = row/(h − 1) look along (sin 2πu sin πv, cos πv, −cos 2πu sin
+    πv).
     """
     v = np.arange(height)[:, None] / (height - 1) * np.pi
     u = (np.arange(2 * height)[None, :] + 0.5) / (2 * height) * 2 * np.pi
-    directions = np.stack([np.sin(u) * np.sin(v), np.cos(v) + 0 * u, -np.cos(u) * np.sin(v)], axis=-1)
+    directions = np.stack(
+        [np.sin(u) * np.sin(v), np.cos(v) + 0 * u, -np.cos(u) * np.sin(v)], axis=-1
+    )
     values = np.asarray(function(directions.reshape(-1, 3)), np.float32)
     return np.broadcast_to(values.reshape(height, 2 * height, -1), (height, 2 * height, 3)).copy()
 
@@ -95,7 +112,9 @@ def uniform_directions(rng, count):
 
 
 def cosine_directions(rng, normals):
-    """One cosine-distributed direction about each normal (k, 3): the normal plus a uniform unit vector (Malley)."""
+    """One cosine-distributed direction about each normal (k, 3): the normal plus a uniform unit
+    vector (Malley).
+    """
     vectors = normals + uniform_directions(rng, len(normals))
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
@@ -103,7 +122,9 @@ def cosine_directions(rng, normals):
 def ray_test(mi_scene, origins, directions):
     """Whether rays (k, 3) hit anything, by Mitsuba."""
     mi = mitsuba()
-    ray = mi.Ray3f(mi.Point3f(origins.T.astype(np.float32)), mi.Vector3f(directions.T.astype(np.float32)))
+    ray = mi.Ray3f(
+        mi.Point3f(origins.T.astype(np.float32)), mi.Vector3f(directions.T.astype(np.float32))
+    )
     return np.array(mi_scene.ray_test(ray))
 
 
@@ -119,7 +140,9 @@ def emitted(emitter, directions):
 
 
 def relative_l2(result, reference):
-    return float(np.linalg.norm(np.subtract(result, reference, dtype=np.float64)) / np.linalg.norm(reference))
+    return float(
+        np.linalg.norm(np.subtract(result, reference, dtype=np.float64)) / np.linalg.norm(reference)
+    )
 
 
 def bias(result, reference):
@@ -127,17 +150,20 @@ def bias(result, reference):
     return float(np.sum(result, dtype=np.float64) / np.sum(reference, dtype=np.float64) - 1)
 
 
-# --- statistics ------------------------------------------------------------------------------------------------------
+# --- statistics -----------------------------------------------------------------------------------
 
-FALSE_POSITIVES = 0.01  # of a statistical test; seeds are fixed, so this is how likely it was to write one that fails
+# of a statistical test; seeds are fixed, so this is how likely it was to write one that fails
+FALSE_POSITIVES = 0.01
 
 
 def largest_z(count):
-    """What the largest |z| of `count` standard normal numbers exceeds in 1 % of all cases (Šidák)."""
+    """What the largest |z| of `count` standard normal numbers exceeds in 1 % of all cases
+    (Šidák).
+    """
     return scipy.stats.norm.isf((1 - (1 - FALSE_POSITIVES) ** (1 / count)) / 2)
 
 
-# --- transport without a basis ---------------------------------------------------------------------------------------
+# --- transport without a basis --------------------------------------------------------------------
 
 
 def mesh(vertices, faces, normals=None, bsdf=None):
@@ -146,7 +172,9 @@ def mesh(vertices, faces, normals=None, bsdf=None):
     properties = mi.Properties()
     if bsdf:
         properties["bsdf"] = mi.load_dict(bsdf)
-    result = mi.Mesh("mesh", len(vertices), len(faces), has_vertex_normals=normals is not None, props=properties)
+    result = mi.Mesh(
+        "mesh", len(vertices), len(faces), has_vertex_normals=normals is not None, props=properties
+    )
     parameters = mi.traverse(result)
     parameters["vertex_positions"] = np.ravel(vertices).astype(np.float32)
     parameters["faces"] = np.ravel(faces).astype(np.uint32)
@@ -163,7 +191,8 @@ def white(vectors):
 
 @dataclass(frozen=True, eq=False)
 class SampledScene:
-    """What a precomputation knows of a scene before it fits a basis; irradiance itself then stands for coefficients.
+    """What a precomputation knows of a scene before it fits a basis; irradiance itself then stands
+    for coefficients.
 
     `kept` (n,) are the points that are not buried.
     """
@@ -186,22 +215,43 @@ class SampledScene:
         return areas / areas.sum()
 
     def direct(self, sky=white):
-        """Direct irradiance (n, k) under a sky, a function of unit directions (s, 3) that gives radiance (s, k)."""
-        return self.transport.irradiance(sky(self.directions.vectors.astype(float)), self.directions.solid_angles)
+        """Direct irradiance (n, k) under a sky, a function of unit directions (s, 3) that gives
+        radiance (s, k).
+        """
+        return self.transport.irradiance(
+            sky(self.directions.vectors.astype(float)), self.directions.solid_angles
+        )
 
     def hops(self, rays, seed=0, **rest):
-        sampler = HopSampler(self.scene, self.points, self.buried, self.transport, self.directions, rays, seed, **rest)
+        sampler = HopSampler(
+            self.scene,
+            self.points,
+            self.buried,
+            self.transport,
+            self.directions,
+            rays,
+            seed,
+            **rest,
+        )
         return Hops(np.concatenate(list(sampler.blocks())), self.blocked)
 
     def paths(self, count, bounces=None, channels=1, seed=0, encode=None, **rest):
-        return PathSampler(self.scene, self.points, self.directions, count, bounces, channels, encode, seed, **rest)
+        return PathSampler(
+            self.scene, self.points, self.directions, count, bounces, channels, encode, seed, **rest
+        )
 
     def reflections(self, hops, direct, channels, bounces):
-        """Irradiance (c, n, k) after one reflection and more of direct irradiance (n, k), as a precomputation finds it."""
+        """Irradiance (c, n, k) after one reflection and more of direct irradiance (n, k), as a
+        precomputation finds it.
+        """
         if bounces is None:
             return solve(hops, direct, channels, None)
         split = split_by_bounces(hops, 1 - self.blocked, self.shares, channels, bounces)
-        return solve(hops, direct, channels, split) if split.bounces else np.zeros((channels, *direct.shape), np.float32)
+        return (
+            solve(hops, direct, channels, split)
+            if split.bounces
+            else np.zeros((channels, *direct.shape), np.float32)
+        )
 
     def reflected(self, rays, bounces, sky=white, seed=0):
         """The same (n, k) under a sky; three radiances are RGB, and any other number is grey."""
@@ -212,7 +262,9 @@ class SampledScene:
         return np.stack([coloured[channel, :, channel] for channel in range(3)], axis=-1)
 
     def samples_of_paths(self, count, bounces, index, sky=white, seed=0):
-        """Irradiance (b, count, 3) that each path from some points gives alone, so that its noise is known too."""
+        """Irradiance (b, count, 3) that each path from some points gives alone, so that its noise
+        is known too.
+        """
         cell, throughput, _ = self.paths(count, bounces, 3, seed).escapes(index)
         radiance = sky(self.directions.vectors.astype(float))[np.where(cell == NOTHING, 0, cell)]
         return np.pi * np.where((cell != NOTHING)[..., None], throughput * radiance, 0)
@@ -224,4 +276,6 @@ def sampled(parts, edge_length, directions="cubemap:16", rays_per_direction=1):
     points, lattice = sample_points(opened, edge_length), parse_directions(directions)
     transport = sample_direct(opened, points, lattice, rays_per_direction)
     buried = find_buried(opened, points, transport.dark())
-    return SampledScene(opened, points, lattice, transport, buried, blocked_share(transport, lattice.solid_angles))
+    return SampledScene(
+        opened, points, lattice, transport, buried, blocked_share(transport, lattice.solid_angles)
+    )

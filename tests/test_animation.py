@@ -1,4 +1,6 @@
-"""Light paths are Catmull-Rom splines at equal steps of arc length; frames come back from the files that hold them."""
+"""Light paths are Catmull-Rom splines at equal steps of arc length; frames come back from the files
+that hold them.
+"""
 
 from itertools import islice
 
@@ -14,7 +16,9 @@ HEIGHT, WIDTH = 47, 65  # odd, which H.264 is not
 
 
 def frames(count):
-    """Smooth images of which each is another, all in one array: what keeps frames instead of writing them holds only the last."""
+    """Smooth images of which each is another, all in one array: what keeps frames instead of
+    writing them holds only the last.
+    """
     y, x = np.indices((HEIGHT, WIDTH))
     image = np.empty((HEIGHT, WIDTH, 3), np.float32)
     for i in range(count):
@@ -30,16 +34,30 @@ def names(folder):
     return sorted(path.name for path in folder.iterdir())
 
 
-# --- paths -----------------------------------------------------------------------------------------------------------
+# --- paths ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("text", ["0,1,0 1,1,0 1,2,5", "0,1,0;1,1,0;1,2,5", " 0,1,0 ;  1,1,0\n1e0,+2,5.0 "])
+@pytest.mark.parametrize(
+    "text", ["0,1,0 1,1,0 1,2,5", "0,1,0;1,1,0;1,2,5", " 0,1,0 ;  1,1,0\n1e0,+2,5.0 "]
+)
 def test_text_of_a_path(text):
     np.testing.assert_array_equal(light_path(text).keys, [[0, 1, 0], [1, 1, 0], [1, 2, 5]])
 
 
-@pytest.mark.parametrize("text", ["", "1,2,3", "1,2 3,4", "0,0,0 a,b,c", "0,0,0 1,nan,0", "0,0,0 1,1,inf", "0,0,0 1,1,1 1,1,1",
-                                  "0, 0, 0 1, 1, 1", "0,0,0;1,1,1;"])  # fmt: skip
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "1,2,3",
+        "1,2 3,4",
+        "0,0,0 a,b,c",
+        "0,0,0 1,nan,0",
+        "0,0,0 1,1,inf",
+        "0,0,0 1,1,1 1,1,1",
+        "0, 0, 0 1, 1, 1",
+        "0,0,0;1,1,1;",
+    ],
+)
 def test_bad_paths_are_refused(text):
     with pytest.raises(SettingsError):
         light_path(text)
@@ -52,18 +70,24 @@ def test_bad_numbers_of_frames_are_refused(count):
 
 
 def test_two_keys_make_a_straight_line():
-    np.testing.assert_allclose(light_path("1,0,0 3,4,0").positions(5), np.linspace([1, 0, 0], [3, 4, 0], 5), atol=1e-12)
+    np.testing.assert_allclose(
+        light_path("1,0,0 3,4,0").positions(5), np.linspace([1, 0, 0], [3, 4, 0], 5), atol=1e-12
+    )
     np.testing.assert_array_equal(light_path("1,0,0 3,4,0").positions(1), [[1, 0, 0]])
 
 
 def test_there_and_back():
-    """A closed path of two different keys is the line between them, twice; six steps of a third of its length."""
+    """A closed path of two different keys is the line between them, twice; six steps of a third of
+    its length.
+    """
     expected = np.array([0, 1, 2, 3, 2, 1])[:, None] / 3 * [0, 0, 6.0]
     np.testing.assert_allclose(light_path("0,0,0 0,0,6 0,0,0").positions(6), expected, atol=1e-9)
 
 
 def barry_goldman(keys, parameter):
-    """The centripetal Catmull-Rom curve between the middle two of four keys, by Barry and Goldman's pyramid; parameter 0…1."""
+    """The centripetal Catmull-Rom curve between the middle two of four keys, by Barry and Goldman's
+    pyramid; parameter 0…1.
+    """
     t = np.concatenate([[0], np.cumsum(np.sqrt(np.linalg.norm(np.diff(keys, axis=0), axis=1)))])
     x = (t[1] + (t[2] - t[1]) * parameter)[:, None]
 
@@ -77,10 +101,12 @@ def barry_goldman(keys, parameter):
 
 @pytest.mark.parametrize("closed", [False, True])
 def test_the_curve_is_catmull_roms(closed):
-    """Positions lie on the curve of another algorithm, at equal steps of its length, and that goes through all keys.
+    """Positions lie on the curve of another algorithm, at equal steps of its length, and that goes
+    through all keys.
 
-    Rationale: an open path's first and last piece see the neighbouring key mirrored at the end; a closed one goes round. The
-    reference is a fine polygon, 4000 edges a piece, so that distances to it are below 1e-6 of the path's length.
+    Rationale: an open path's first and last piece see the neighbouring key mirrored at the end; a
+    closed one goes round. The reference is a fine polygon, 4000 edges a piece, so that distances to
+    it are below 1e-6 of the path's length.
     """
     keys = np.random.default_rng(3).uniform(-2, 2, (6, 3))
     if closed:
@@ -89,7 +115,9 @@ def test_the_curve_is_catmull_roms(closed):
     else:
         around = np.vstack([2 * keys[0] - keys[1], keys, 2 * keys[-1] - keys[-2]])
     s = np.linspace(0, 1, 4001)
-    curve = np.concatenate([barry_goldman(around[i : i + 4], s)[:-1] for i in range(5)] + [keys[-1:]])
+    curve = np.concatenate(
+        [barry_goldman(around[i : i + 4], s)[:-1] for i in range(5)] + [keys[-1:]]
+    )
     length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))])
     count = 101
     wanted = np.linspace(0, length[-1], count, endpoint=not closed)
@@ -99,7 +127,9 @@ def test_the_curve_is_catmull_roms(closed):
 
 
 def test_a_closed_path_has_no_corner():
-    """Around a square: each step is as long as the others, and none turns by more than the eighth of a turn that 100 allow."""
+    """Around a square: each step is as long as the others, and none turns by more than the eighth
+    of a turn that 100 allow.
+    """
     positions = light_path("0,0,0 1,0,0 1,1,0 0,1,0 0,0,0").positions(100)
     steps = np.diff(np.vstack([positions, positions[:2]]), axis=0)
     lengths = np.linalg.norm(steps, axis=1)
@@ -108,15 +138,22 @@ def test_a_closed_path_has_no_corner():
     assert turns.min() > np.cos(np.pi / 8)
 
 
-# --- files ------------------------------------------------------------------------------------------------------------
+# --- files ----------------------------------------------------------------------------------------
 
 
 def test_gif(tmp_path):
-    """40 frames of 20 ms, in a loop, in their order. A palette of 256 colours for 3055 of a smooth image, dithered, is within
-    some levels of 255 on the mean; the colour that says which frame it is, constant over a frame, within 3."""
+    """40 frames of 20 ms, in a loop, in their order. A palette of 256 colours for 3055 of a smooth
+    image, dithered, is within some levels of 255 on the mean; the colour that says which frame it
+    is, constant over a frame, within 3.
+    """
     assert write_frames(tmp_path / "a.gif", frames(40), fps=50) == 40
     with Image.open(tmp_path / "a.gif") as image:
-        assert (image.n_frames, image.size, image.info["duration"], image.info["loop"]) == (40, (WIDTH, HEIGHT), 20, 0)
+        assert (image.n_frames, image.size, image.info["duration"], image.info["loop"]) == (
+            40,
+            (WIDTH, HEIGHT),
+            20,
+            0,
+        )
         for i, expected in enumerate(stored(40)):
             image.seek(i)
             shown = np.array(image.convert("RGB")).astype(int)
@@ -127,7 +164,9 @@ def test_gif(tmp_path):
 
 @pytest.mark.parametrize("fps", [25, 24000 / 1001])
 def test_mp4(tmp_path, fps):
-    """Frames come back in their order within what 8-bit BT.709 with video range and subsampled colour can hold; the size is even."""
+    """Frames come back in their order within what 8-bit BT.709 with video range and subsampled
+    colour can hold; the size is even.
+    """
     assert write_frames(tmp_path / "a.mp4", frames(40), fps) == 40
     with av.open(tmp_path / "a.mp4") as file:
         stream = file.streams.video[0]
@@ -151,9 +190,14 @@ def test_numbered_images(tmp_path):
         np.testing.assert_array_equal(np.array(Image.open(folder / name)), expected)
 
 
-@pytest.mark.parametrize("name, left", [("a.mp4", ["a.mp4"]), ("a.gif", ["a.gif"]), ("a%d.png", ["a0.png", "a1.png", "a2.png"])])
+@pytest.mark.parametrize(
+    "name, left",
+    [("a.mp4", ["a.mp4"]), ("a.gif", ["a.gif"]), ("a%d.png", ["a0.png", "a1.png", "a2.png"])],
+)
 def test_an_interruption_leaves_nothing_half(tmp_path, name, left):
-    """Ctrl-C in the fourth frame: a video that was there stays as it was, and of images there are three whole ones."""
+    """Ctrl-C in the fourth frame: a video that was there stays as it was, and of images there are
+    three whole ones.
+    """
 
     def interrupted():
         yield from islice(frames(10), 3)
@@ -184,11 +228,21 @@ def test_no_frames_and_frames_of_other_sizes_are_refused(tmp_path, name):
 @pytest.mark.parametrize(
     "name, fps, match",
     [
-        ("a.avi", 25, "must end in"), ("a", 25, "must end in"), ("a.png", 25, "number"), ("a%s.png", 25, "number"),
-        ("a%d%d.png", 25, "number"), ("a%%d.png", 25, "number"), ("nowhere/a.mp4", 25, "does not exist"), ("nowhere/%d.png", 25, "does not exist"),
-        ("a.mp4", 0, "fps"), ("a.mp4", -1, "fps"), ("a.mp4", float("nan"), "fps"), ("a.mp4", 1e9, "fps"), ("a.gif", 51, "fps"),
+        ("a.avi", 25, "must end in"),
+        ("a", 25, "must end in"),
+        ("a.png", 25, "number"),
+        ("a%s.png", 25, "number"),
+        ("a%d%d.png", 25, "number"),
+        ("a%%d.png", 25, "number"),
+        ("nowhere/a.mp4", 25, "does not exist"),
+        ("nowhere/%d.png", 25, "does not exist"),
+        ("a.mp4", 0, "fps"),
+        ("a.mp4", -1, "fps"),
+        ("a.mp4", float("nan"), "fps"),
+        ("a.mp4", 1e9, "fps"),
+        ("a.gif", 51, "fps"),
     ],
-)  # fmt: skip
+)
 def test_bad_outputs_are_refused_before_a_frame_is_made(tmp_path, name, fps, match):
     def never():
         raise AssertionError("a frame was asked for")

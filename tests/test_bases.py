@@ -1,30 +1,38 @@
-"""All bases on all lattices through the whole program: fit, file, relighting, rotation, and what `info` says of their storage."""
+"""All bases on all lattices through the whole program: fit, file, relighting, rotation, and what
+`info` says of their storage.
+"""
 
 import json
 
 import h5py
 import numpy as np
 import pytest
+from conftest import bias, cube, diffuse, disk, rectangle, relative_l2, scene, sky_of
 
 import mi_prt
-from conftest import bias, cube, diffuse, disk, rectangle, relative_l2, scene, sky_of
 from mi_prt import AssetError, SettingsError
 from mi_prt.basis.bases import BASES
 from mi_prt.directions import parse_directions
 from mi_prt.evaluate import ground_truth
-from mi_prt.precompute.info import describe, describe_asset
 from mi_prt.lighting.cells import cell_radiance
 from mi_prt.lighting.lattice import on_lattice
 from mi_prt.lighting.scene_light import lit_scene
+from mi_prt.precompute.info import describe, describe_asset
 from mi_prt.scene.scene import open_scene
 from mi_prt.transport.direct import sample_direct
 
 PARTS = dict(
-    floor=rectangle(size=2, bsdf=diffuse(0.6)), box=cube((0.2, 0.4, 0), 0.4), ball=disk((0, 1, 0.1), (0.3, 1.5, 0), 0.6)
+    floor=rectangle(size=2, bsdf=diffuse(0.6)),
+    box=cube((0.2, 0.4, 0), 0.4),
+    ball=disk((0, 1, 0.1), (0.3, 1.5, 0), 0.6),
 )
 COLOURED = PARTS | dict(floor=rectangle(size=2, bsdf=diffuse([0.7, 0.5, 0.2])))
 COEFFICIENTS = {"pca": 36, "sh": 36, "haar": 36, "haar-shared": 36, "none": None}
-REFLECTING = {"pca reflecting": "pca", "sh reflecting": "sh", "haar-shared reflecting": "haar-shared"}
+REFLECTING = {
+    "pca reflecting": "pca",
+    "sh reflecting": "sh",
+    "haar-shared reflecting": "haar-shared",
+}
 LATTICES = ("cubemap:16", "latlong:48x24", "halton:1200")
 
 
@@ -32,26 +40,36 @@ def sky():
     """A smooth sky with a bright and coloured patch about (1, 2, 1)."""
     toward = np.array([1, 2, 1]) / 6**0.5
     colour = np.array([3.0, 2.0, 1.0])
-    return mi_prt.EnvironmentMap(sky_of(lambda d: 0.3 + np.exp(8 * (d @ toward - 1))[:, None] * colour, 64))
+    return mi_prt.EnvironmentMap(
+        sky_of(lambda d: 0.3 + np.exp(8 * (d @ toward - 1))[:, None] * colour, 64)
+    )
 
 
 def precompute(parts=PARTS, directions="cubemap:16", edge_length=0.3, bounces=0, **settings):
     """Of direct light, unless bounces are asked for."""
-    return mi_prt.precompute.precompute(scene(**parts), directions=directions, edge_length=edge_length, bounces=bounces, **settings)
+    return mi_prt.precompute(
+        scene(**parts), directions=directions, edge_length=edge_length, bounces=bounces, **settings
+    )
 
 
 @pytest.fixture(scope="module")
 def assets():
     """An asset of every basis, on the same points and the same lattice."""
-    return {kind: precompute(basis=kind, coefficients=coefficients) for kind, coefficients in COEFFICIENTS.items()}
+    return {
+        kind: precompute(basis=kind, coefficients=coefficients)
+        for kind, coefficients in COEFFICIENTS.items()
+    }
 
 
 @pytest.fixture(scope="module")
 def every(assets):
-    """These, and with light that the floor colours those of the bases that hold it: principal components of all channels, or three rows
-    of coefficients for each point."""
+    """These, and with light that the floor colours those of the bases that hold it: principal
+    components of all channels, or three rows of coefficients for each point.
+    """
     settings = dict(bounces=2, paths_per_point=32, coefficients=36)
-    return assets | {name: precompute(COLOURED, basis=kind, **settings) for name, kind in REFLECTING.items()}
+    return assets | {
+        name: precompute(COLOURED, basis=kind, **settings) for name, kind in REFLECTING.items()
+    }
 
 
 @pytest.fixture(scope="module")
@@ -68,18 +86,22 @@ def weighted_error(asset, sampled):
     return relative_l2(asset.transport(rows) * w, sampled[rows] * w)
 
 
-# --- one protocol --------------------------------------------------------------------------------------------------
+# --- one protocol ---------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", [*BASES, *REFLECTING])
 def test_irradiance_is_the_response_of_the_reconstruction(every, kind):
-    """E = Σ_j w_j L_j T̂_j for any basis, channel by channel: projecting light loses nothing more than the transport has lost."""
+    """E = Σ_j w_j L_j T̂_j for any basis, channel by channel: projecting light loses nothing more
+    than the transport has lost.
+    """
     asset = every[kind]
     w, radiance = asset.directions.solid_angles, cell_radiance(sky(), asset.directions)
     n = len(asset.points)
     transport = asset.transport(np.arange(n))
     if kind in REFLECTING:
-        assert asset.coefficients.shape == ((n, 36) if kind == "pca reflecting" else (n, 3, 36)) and transport.shape == (n, 3, 1536)
+        assert asset.coefficients.shape == (
+            (n, 36) if kind == "pca reflecting" else (n, 3, 36)
+        ) and transport.shape == (n, 3, 1536)
         assert relative_l2(transport[:, 0], transport[:, 2]) > 1e-3
         expected = np.stack([transport[:, c] @ (w * radiance[:, c]) for c in range(3)], axis=-1)
     else:
@@ -89,9 +111,13 @@ def test_irradiance_is_the_response_of_the_reconstruction(every, kind):
 
 @pytest.mark.parametrize("kind", BASES)
 def test_the_reported_error_is_that_of_the_transport(assets, sampled, kind):
-    """Told by the fit from sums of squares, here taken from the reconstruction itself; captured variance likewise."""
+    """Told by the fit from sums of squares, here taken from the reconstruction itself; captured
+    variance likewise.
+    """
     asset = assets[kind]
-    assert asset.report["relative_error"] == pytest.approx(weighted_error(asset, sampled), rel=2e-3, abs=1e-6)
+    assert asset.report["relative_error"] == pytest.approx(
+        weighted_error(asset, sampled), rel=2e-3, abs=1e-6
+    )
     rows = sampled[~asset.buried] * np.sqrt(asset.directions.solid_angles)
     spread = np.linalg.norm(rows - rows.mean(axis=0)) / np.linalg.norm(rows)
     captured = 1 - (weighted_error(asset, sampled) / spread) ** 2
@@ -99,7 +125,9 @@ def test_the_reported_error_is_that_of_the_transport(assets, sampled, kind):
 
 
 def test_principal_components_are_the_best_linear_basis(assets, sampled):
-    """At equal count no linear basis has a lower error (Eckart and Young); the best of each row is not linear, and is lower here."""
+    """At equal count no linear basis has a lower error (Eckart and Young); the best of each row is
+    not linear, and is lower here.
+    """
     errors = {kind: weighted_error(asset, sampled) for kind, asset in assets.items()}
     assert errors["pca"] < errors["sh"] and errors["pca"] < errors["haar-shared"]
     assert errors["haar"] < errors["haar-shared"]
@@ -110,7 +138,11 @@ def test_principal_components_are_the_best_linear_basis(assets, sampled):
 def test_the_theorem_holds_at_every_count(components):
     """PCA ≤ SH and PCA ≤ shared Haar from a few to many coefficients."""
     errors = {
-        kind: precompute(directions="cubemap:8", basis=kind, coefficients=components).report["relative_error"]
+        kind: (
+            precompute(directions="cubemap:8", basis=kind, coefficients=components).report[
+                "relative_error"
+            ]
+        )
         for kind in ("pca", "sh", "haar-shared")
     }
     assert errors["pca"] <= min(errors["sh"], errors["haar-shared"]) + 1e-6
@@ -118,7 +150,9 @@ def test_the_theorem_holds_at_every_count(components):
 
 @pytest.mark.parametrize("kind", [*BASES, *REFLECTING])
 def test_files_of_every_basis(every, tmp_path, kind):
-    """What is loaded relights as what was saved, bit for bit, and is saved again as the same bytes."""
+    """What is loaded relights as what was saved, bit for bit, and is saved again as the same
+    bytes.
+    """
     asset = every[kind]
     asset.save(tmp_path / "a.prt")
     loaded = mi_prt.load(tmp_path / "a.prt")
@@ -132,10 +166,20 @@ def test_files_of_every_basis(every, tmp_path, kind):
 
 @pytest.mark.parametrize(
     ("kind", "name"),
-    [("haar", "coefficients/indices"), ("haar", "coefficients/values"), ("none", "coefficients/visibility"), ("none", "basis/weights"),
-     ("sh", "basis/vectors"), ("haar-shared", "coefficients"), ("sh reflecting", "coefficients"), ("haar-shared reflecting", "basis/vectors"),
-     ("pca reflecting", "coefficients"), ("pca reflecting", "basis/vectors"), ("pca reflecting", "basis/mean")],
-)  # fmt: skip
+    [
+        ("haar", "coefficients/indices"),
+        ("haar", "coefficients/values"),
+        ("none", "coefficients/visibility"),
+        ("none", "basis/weights"),
+        ("sh", "basis/vectors"),
+        ("haar-shared", "coefficients"),
+        ("sh reflecting", "coefficients"),
+        ("haar-shared reflecting", "basis/vectors"),
+        ("pca reflecting", "coefficients"),
+        ("pca reflecting", "basis/vectors"),
+        ("pca reflecting", "basis/mean"),
+    ],
+)
 def test_arrays_that_do_not_fit_together_are_refused(every, tmp_path, kind, name):
     every[kind].save(tmp_path / "a.prt")
     with h5py.File(tmp_path / "a.prt", "r+") as file:
@@ -162,7 +206,9 @@ def test_unknown_bases_and_indices_beyond_the_lattice_are_refused(assets, tmp_pa
 @pytest.mark.parametrize("rays", [1, 3])
 def test_single_entries_of_bits_are_those_of_the_rows(rays):
     """Read bit by bit for point lights, expanded for all else: the same numbers."""
-    asset = precompute(directions="cubemap:8", edge_length=0.5, basis="none", rays_per_direction=rays)
+    asset = precompute(
+        directions="cubemap:8", edge_length=0.5, basis="none", rays_per_direction=rays
+    )
     cells = np.random.default_rng(0).integers(0, 384, (len(asset.points), 40))
     expected = np.take_along_axis(asset.transport(np.arange(len(asset.points))), cells, axis=1)
     np.testing.assert_allclose(asset.basis.at(asset.coefficients, cells), expected, atol=1e-6)
@@ -171,34 +217,55 @@ def test_single_entries_of_bits_are_those_of_the_rows(rays):
     assert (expected > 0).mean() > 0.1
 
 
-# --- lattices ------------------------------------------------------------------------------------------------------
+# --- lattices -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("lattice", LATTICES)
 @pytest.mark.parametrize("kind", ["pca", "sh", "none"])
 def test_every_lattice_agrees_with_mitsuba(lattice, kind):
-    """A smooth sky over a scene with shadows: 1,200 to 1,536 cells and 36 coefficients, within 6 % and 1 % of bias; 3 % without a basis."""
-    asset = precompute(directions=lattice, basis=kind, coefficients=COEFFICIENTS[kind], rays_per_direction=2)
+    """A smooth sky over a scene with shadows: 1,200 to 1,536 cells and 36 coefficients, within 6 %
+    and 1 % of bias; 3 % without a basis.
+    """
+    asset = precompute(
+        directions=lattice, basis=kind, coefficients=COEFFICIENTS[kind], rays_per_direction=2
+    )
     seen = np.flatnonzero(~asset.buried)
-    truth = ground_truth.point_irradiance(lit_scene(open_scene(scene(**PARTS)).mi_scene, sky()), asset.points.at(seen), 8192)
+    truth = ground_truth.point_irradiance(
+        lit_scene(open_scene(scene(**PARTS)).mi_scene, sky()), asset.points.at(seen), 8192
+    )
     result = asset.irradiance(sky())[seen]
     assert truth.noise < 0.015
     assert relative_l2(result, truth.mean) < {"pca": 0.06, "sh": 0.10, "none": 0.03}[kind]
     assert abs(bias(result, truth.mean)) < 0.01
 
 
-@pytest.mark.parametrize(("lattice", "indirect"), [*((lattice, "solve") for lattice in LATTICES), ("halton:1200", "paths")])
+@pytest.mark.parametrize(
+    ("lattice", "indirect"),
+    [*((lattice, "solve") for lattice in LATTICES), ("halton:1200", "paths")],
+)
 def test_every_lattice_agrees_with_mitsuba_after_reflections(lattice, indirect):
-    """The same of a coloured floor and one reflection, with the limits of above: reflected light is smooth, and unbiased as well. Direct
-    light alone would be darker by more than 3 %."""
-    asset = precompute(COLOURED, lattice, bounces=1, indirect=indirect, paths_per_point=128, coefficients=36, rays_per_direction=2)
+    """The same of a coloured floor and one reflection, with the limits of above: reflected light is
+    smooth, and unbiased as well. Direct light alone would be darker by more than 3 %.
+    """
+    asset = precompute(
+        COLOURED,
+        lattice,
+        bounces=1,
+        indirect=indirect,
+        paths_per_point=128,
+        coefficients=36,
+        rays_per_direction=2,
+    )
     seen = np.flatnonzero(~asset.buried)
     lit = lit_scene(open_scene(scene(**COLOURED)).mi_scene, sky())
     truth = ground_truth.irradiance(lit, asset.points.at(seen), 8192, 512, 1)
     result = asset.irradiance(sky())[seen]
     assert truth.noise < 0.015
     assert relative_l2(result, truth.mean) < 0.06 and abs(bias(result, truth.mean)) < 0.01
-    assert bias(ground_truth.point_irradiance(lit, asset.points.at(seen), 8192).mean, truth.mean) < -0.03
+    assert (
+        bias(ground_truth.point_irradiance(lit, asset.points.at(seen), 8192).mean, truth.mean)
+        < -0.03
+    )
 
 
 @pytest.mark.parametrize("lattice", ["latlong:48x24", "halton:1200", "cubemap:12"])
@@ -209,7 +276,7 @@ def test_wavelets_need_their_cubemap(lattice, kind):
         precompute(directions=lattice, basis=kind)
 
 
-# --- numbers of coefficients ---------------------------------------------------------------------------------------
+# --- numbers of coefficients ----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", ["pca", "sh", "haar", "haar-shared"])
@@ -219,7 +286,9 @@ def test_as_few_coefficients_as_capture_the_variance(kind, variance):
     settings = dict(edge_length=0.4, basis=kind)
     asset = precompute(coefficients="auto", variance=variance, **settings)
     assert asset.report["captured_variance"] >= variance
-    assert asset.settings["variance"] == variance and asset.settings["coefficients"] == len(asset.basis)
+    assert asset.settings["variance"] == variance and asset.settings["coefficients"] == len(
+        asset.basis
+    )
     fewer = (int(len(asset.basis) ** 0.5) - 1) ** 2 if kind == "sh" else len(asset.basis) - 1
     if fewer > 0:
         less = precompute(coefficients=fewer, **settings)
@@ -235,13 +304,26 @@ def test_a_search_beyond_the_first_components():
 
 @pytest.mark.parametrize(
     "bad",
-    [dict(variance=0.9), dict(coefficients=10, variance=0.9), dict(coefficients="auto", variance=1.0), dict(coefficients="auto", variance=0),
-     dict(coefficients="auto", variance=float("nan")), dict(coefficients="auto", variance="x"), dict(coefficients="all"),
-     dict(basis="none", coefficients=10), dict(basis="none", coefficients="auto"), dict(basis="fourier"), dict(basis="sh", coefficients=10),
-     dict(basis="sh", coefficients=0), dict(basis="sh", coefficients=900), dict(basis="haar", coefficients=0), dict(basis=None),
-     dict(basis="haar", coefficients=385)],
+    [
+        dict(variance=0.9),
+        dict(coefficients=10, variance=0.9),
+        dict(coefficients="auto", variance=1.0),
+        dict(coefficients="auto", variance=0),
+        dict(coefficients="auto", variance=float("nan")),
+        dict(coefficients="auto", variance="x"),
+        dict(coefficients="all"),
+        dict(basis="none", coefficients=10),
+        dict(basis="none", coefficients="auto"),
+        dict(basis="fourier"),
+        dict(basis="sh", coefficients=10),
+        dict(basis="sh", coefficients=0),
+        dict(basis="sh", coefficients=900),
+        dict(basis="haar", coefficients=0),
+        dict(basis=None),
+        dict(basis="haar", coefficients=385),
+    ],
     ids=str,
-)  # fmt: skip
+)
 def test_bad_settings(bad):
     """One line, before any work, that names what was asked for."""
     with pytest.raises(SettingsError) as caught:
@@ -249,19 +331,24 @@ def test_bad_settings(bad):
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(("kind", "lattice"), [("pca", "cubemap:1"), ("sh", "cubemap:1"), ("haar", "cubemap:1"), ("sh", "halton:6")])
+@pytest.mark.parametrize(
+    ("kind", "lattice"),
+    [("pca", "cubemap:1"), ("sh", "cubemap:1"), ("haar", "cubemap:1"), ("sh", "halton:6")],
+)
 def test_defaults_fit_small_lattices(kind, lattice):
     """The default number falls to what there is; it never refuses."""
     asset = precompute(directions=lattice, edge_length=0.8, basis=kind, bounces=None)
     assert 0 < len(asset.basis) <= 6
 
 
-# --- turning light -------------------------------------------------------------------------------------------------
+# --- turning light --------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", [*BASES, *REFLECTING])
 def test_prepared_light_turns_as_the_map_does(every, kind):
-    """Against the turned map averaged anew; for harmonics the turn is exact but for what cell averages blur."""
+    """Against the turned map averaged anew; for harmonics the turn is exact but for what cell
+    averages blur.
+    """
     asset = every[kind]
     prepared = asset.prepare_light(sky())
     for axis, degrees in [("y", 0), ("y", 50), ((1, 2, 3), 130), ("x", 180)]:
@@ -277,7 +364,9 @@ def test_turns_of_harmonics_compose_exactly(assets):
     for _ in range(360):
         turned = turned.rotated((1, 2, 3), 1)
     np.testing.assert_allclose(asset.irradiance(turned), asset.irradiance(prepared), rtol=1e-4)
-    assert relative_l2(asset.irradiance(prepared.rotated("x", 90)), asset.irradiance(prepared)) > 0.1
+    assert (
+        relative_l2(asset.irradiance(prepared.rotated("x", 90)), asset.irradiance(prepared)) > 0.1
+    )
 
 
 def test_prepared_light_keeps_local_lights(every):
@@ -291,8 +380,12 @@ def test_prepared_light_keeps_local_lights(every):
 
 
 def test_light_prepared_for_one_basis_is_light_to_all(every):
-    """Harmonics prepared for an asset of harmonics are the map they came from to every other basis, in the integrator too."""
-    prepared = every["sh"].prepare_light([sky(), mi_prt.PointLight((3, 4, 2), 50.0)]).rotated("y", 40)
+    """Harmonics prepared for an asset of harmonics are the map they came from to every other basis,
+    in the integrator too.
+    """
+    prepared = (
+        every["sh"].prepare_light([sky(), mi_prt.PointLight((3, 4, 2), 50.0)]).rotated("y", 40)
+    )
     for kind, asset in every.items():
         expected = asset.irradiance([sky().rotated("y", 40), mi_prt.PointLight((3, 4, 2), 50.0)])
         assert relative_l2(asset.irradiance(prepared), expected) < 0.01, kind
@@ -307,30 +400,42 @@ def test_light_prepared_for_one_basis_is_light_to_all(every):
 def test_constant_light_stays_constant_when_it_turns(lattice):
     """In every cell, those at the poles too, which are thinner than the fine lattice's cells."""
     directions = parse_directions(lattice)
-    prepared = on_lattice(mi_prt.EnvironmentMap(np.full((8, 16, 3), 2.0)), directions).rotated((1, 2, 3), 33)
+    prepared = on_lattice(mi_prt.EnvironmentMap(np.full((8, 16, 3), 2.0)), directions).rotated(
+        (1, 2, 3), 33
+    )
     np.testing.assert_allclose(cell_radiance(prepared, directions), 2, rtol=1e-5)
 
 
-# --- storage -------------------------------------------------------------------------------------------------------
+# --- storage --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", [*BASES, *REFLECTING])
 def test_storage_is_as_the_formula_says(every, tmp_path, kind):
-    """4d(v + 1) and 4ds bytes (section 7.1), of Haar 6 bytes a coefficient and no matrix, without a basis a bit a ray; where reflections
-    are coloured three times the matrix of principal components, and three times the coefficients in the other bases. The arrays in the
-    file take just that."""
+    """4d(v + 1) and 4ds bytes (section 7.1), of Haar 6 bytes a coefficient and no matrix, without a
+    basis a bit a ray; where reflections are coloured three times the matrix of principal
+    components, and three times the coefficients in the other bases. The arrays in the file take
+    just that.
+    """
     asset = every[kind]
     asset.save(tmp_path / "a.prt")
     storage = describe_asset(asset)["storage"]
     v, s, d = len(asset.points), 1536, 36
     light = {"haar": s, "none": s}.get(kind, d)
-    sets, functions = {"pca reflecting": (1, 3), "sh reflecting": (3, 1), "haar-shared reflecting": (3, 1)}.get(kind, (1, 1))
+    sets, functions = {
+        "pca reflecting": (1, 3),
+        "sh reflecting": (3, 1),
+        "haar-shared reflecting": (3, 1),
+    }.get(kind, (1, 1))
     coefficients = {"haar": 6 * d * v, "none": s // 16 * v}.get(kind, 4 * d * v * sets)
     assert storage["predicted"]["relighting"] == coefficients + 4 * light
-    assert storage["predicted"]["projection"] == {"haar": 0, "none": 4 * s}.get(kind, 4 * d * s * functions)
+    assert storage["predicted"]["projection"] == {"haar": 0, "none": 4 * s}.get(
+        kind, 4 * d * s * functions
+    )
     with h5py.File(tmp_path / "a.prt") as file:
         stored = file["coefficients"]
-        datasets = [stored] if isinstance(stored, h5py.Dataset) else [stored[name] for name in stored]
+        datasets = (
+            [stored] if isinstance(stored, h5py.Dataset) else [stored[name] for name in stored]
+        )
         assert storage["measured"]["coefficients"] == sum(x.nbytes for x in datasets)
     rays = 12 * s // 2 if kind == "none" else 0  # their vectors
     assert storage["measured"]["coefficients"] == coefficients + rays
@@ -341,28 +446,53 @@ def test_storage_is_as_the_formula_says(every, tmp_path, kind):
 @pytest.mark.parametrize("kind", ["pca", "haar"])
 def test_storage_is_predicted_from_the_scene(assets, kind):
     """Before any work, the same figures."""
-    settings = dict(directions="cubemap:16", edge_length=0.3, basis=kind, coefficients=36, bounces=0)
+    settings = dict(
+        directions="cubemap:16", edge_length=0.3, basis=kind, coefficients=36, bounces=0
+    )
     predicted = describe(scene(**PARTS), **settings)["predicted"]
     storage = describe_asset(assets[kind])["storage"]["predicted"]
-    assert (predicted["relighting_bytes"], predicted["projection_bytes"]) == (storage["relighting"], storage["projection"])
+    assert (predicted["relighting_bytes"], predicted["projection_bytes"]) == (
+        storage["relighting"],
+        storage["projection"],
+    )
 
 
 @pytest.mark.parametrize("kind", ["pca", "sh"])
 def test_reflections_are_predicted_from_the_scene(every, kind):
-    """Storage of three channels, the settings, and how light splits by reflections: a probe of 256 of the 600 points tells direct
-    light to 1.5 % and the first reflection, in which they differ more, to 10 % (one standard error); three of them are allowed."""
-    settings = dict(directions="cubemap:16", edge_length=0.3, basis=kind, coefficients=36, bounces=2, paths_per_point=32)
-    found, held = describe(scene(**COLOURED), **settings), describe_asset(every[f"{kind} reflecting"])
+    """Storage of three channels, the settings, and how light splits by reflections: a probe of 256
+    of the 600 points tells direct light to 1.5 % and the first reflection, in which they differ
+    more, to 10 % (one standard error); three of them are allowed.
+    """
+    settings = dict(
+        directions="cubemap:16",
+        edge_length=0.3,
+        basis=kind,
+        coefficients=36,
+        bounces=2,
+        paths_per_point=32,
+    )
+    found, held = (
+        describe(scene(**COLOURED), **settings),
+        describe_asset(every[f"{kind} reflecting"]),
+    )
     predicted, storage = found["predicted"], held["storage"]["predicted"]
-    assert (predicted["relighting_bytes"], predicted["projection_bytes"]) == (storage["relighting"], storage["projection"])
-    assert {name: found["settings"][name]["value"] for name in ("bounces", "indirect", "paths_per_point", "denoise")} == {
-        "bounces": 2, "indirect": "solve", "paths_per_point": 32, "denoise": True
-    }  # fmt: skip
+    assert (predicted["relighting_bytes"], predicted["projection_bytes"]) == (
+        storage["relighting"],
+        storage["projection"],
+    )
+    assert {
+        name: found["settings"][name]["value"]
+        for name in ("bounces", "indirect", "paths_per_point", "denoise")
+    } == {"bounces": 2, "indirect": "solve", "paths_per_point": 32, "denoise": True}
     energy = held["report"]["bounce_energy"]
     assert held["bounces"] == 2 and len(energy) == len(found["requires"]["bounce_energy"]) == 3
-    assert (np.abs(np.divide(found["requires"]["bounce_energy"][:2], energy[:2]) - 1) < [0.045, 0.3]).all()
+    assert (
+        np.abs(np.divide(found["requires"]["bounce_energy"][:2], energy[:2]) - 1) < [0.045, 0.3]
+    ).all()
 
 
 def test_info_of_automatic_coefficients():
-    settings = describe(scene(**PARTS), directions="cubemap:4", edge_length=0.8, coefficients="auto", variance=0.9)["settings"]
+    settings = describe(
+        scene(**PARTS), directions="cubemap:4", edge_length=0.8, coefficients="auto", variance=0.9
+    )["settings"]
     assert settings["coefficients"]["value"] == "auto" and settings["variance"]["value"] == 0.9

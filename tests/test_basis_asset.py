@@ -1,4 +1,6 @@
-"""The basis against NumPy's SVD, and the asset file: what it holds, that it can be trusted, and how it fails."""
+"""The basis against NumPy's SVD, and the asset file: what it holds, that it can be trusted, and how
+it fails.
+"""
 
 import hashlib
 import json
@@ -11,11 +13,10 @@ import h5py
 import numpy as np
 import pytest
 import threadpoolctl
+from conftest import bias, cube, diffuse, disk, rectangle, relative_l2, scene, sphere, uniform_sky
 
 import mi_prt
 import mi_prt.transport.direct
-from conftest import bias, cube, diffuse, disk, rectangle, relative_l2, scene, sphere, uniform_sky
-from mi_prt.precompute import budget as room
 from mi_prt import AssetError, SettingsError
 from mi_prt.basis import pca
 from mi_prt.basis.pca import fit_pca
@@ -23,30 +24,38 @@ from mi_prt.basis.rows import Rows
 from mi_prt.basis.target import Target
 from mi_prt.directions import Cubemap
 from mi_prt.lighting.cells import cell_radiance
+from mi_prt.precompute import budget as room
 from mi_prt.precompute.precompute import measure
-from mi_prt.system.runtime import mitsuba
 from mi_prt.scene.scene import open_scene
+from mi_prt.system.runtime import mitsuba
 from mi_prt.transport.direct import sample_direct
 
 mi = mitsuba()
 
 SMALL = dict(
-    floor=rectangle(size=2, bsdf=diffuse(0.6)), box=cube((0.2, 0.4, 0), 0.4), ball=disk((0, 1, 0.1), (0.3, 1.5, 0), 0.6)
+    floor=rectangle(size=2, bsdf=diffuse(0.6)),
+    box=cube((0.2, 0.4, 0), 0.4),
+    ball=disk((0, 1, 0.1), (0.3, 1.5, 0), 0.6),
 )
 
 
 COLOURED = SMALL | dict(floor=rectangle(size=2, bsdf=diffuse([0.7, 0.5, 0.2])))
-# The forms of what is stored: one channel; three channels of the components, or of the coefficients, where reflections colour the light.
+# The forms of what is stored: one channel; three channels of the components, or of the
+# coefficients, where reflections colour the light.
 ASSETS = {
     "direct": {},
     "reflected": dict(parts=COLOURED, bounces=2, paths_per_point=32),
-    "reflected, sh": dict(parts=COLOURED, bounces=2, paths_per_point=32, basis="sh", coefficients=49),
+    "reflected, sh": dict(
+        parts=COLOURED, bounces=2, paths_per_point=32, basis="sh", coefficients=49
+    ),
 }
 
 
 def precompute(parts=SMALL, directions="cubemap:8", edge_length=0.8, bounces=0, **settings):
     """Of direct light, unless bounces are asked for."""
-    return mi_prt.precompute.precompute(scene(**parts), directions=directions, edge_length=edge_length, bounces=bounces, **settings)
+    return mi_prt.precompute(
+        scene(**parts), directions=directions, edge_length=edge_length, bounces=bounces, **settings
+    )
 
 
 @pytest.fixture(scope="module", params=ASSETS)
@@ -66,12 +75,13 @@ def saved(asset, tmp_path_factory):
     return path
 
 
-# --- PCA -----------------------------------------------------------------------------------------------------------
+# --- PCA ------------------------------------------------------------------------------------------
 
 
 def random_matrix(n, s, rank=None, decay=6.0, seed=0):
-    """(n, s) float32 with a mean far from zero: of a rank with exponentially decaying singular values, or of full rank
-    with values that fall as slowly as 1/k."""
+    """(n, s) float32 with a mean far from zero: of a rank with exponentially decaying singular
+    values, or of full rank with values that fall as slowly as 1/k.
+    """
     rng = np.random.default_rng(seed)
     values = 1 / np.arange(1, min(n, s) + 1) if rank is None else np.exp(-np.arange(rank) / decay)
     left, right = rng.standard_normal((n, len(values))), rng.standard_normal((len(values), s))
@@ -89,7 +99,8 @@ def fit(matrix, weights, components, index=None, **options):
 
 
 def svd(matrix, weights):
-    """Squared singular values and right vectors of the centred matrix in the √w-weighted space, in float64.
+    """Squared singular values and right vectors of the centred matrix in the √w-weighted space, in
+    float64.
 
     One thread: a threaded BLAS stalls where other programs run.
     """
@@ -108,7 +119,8 @@ ITERATED = [(2400, 900, 40), (900, 1800, 40), (3000, 800, None)]
 
 @pytest.mark.parametrize(("n", "s", "rank"), EXACT + ITERATED)
 def test_components_are_those_of_the_svd(n, s, rank, monkeypatch):
-    """The decomposition is unique: exact for small shapes; iterated, captured variance is within 1e-3 of the optimum.
+    """The decomposition is unique: exact for small shapes; iterated, captured variance is within
+    1e-3 of the optimum.
 
     Small shapes are exact, where that is negligible; else the way that costs less is taken.
     """
@@ -133,20 +145,26 @@ def test_components_are_those_of_the_svd(n, s, rank, monkeypatch):
 
 
 def test_encode_and_reconstruct_are_the_projection():
-    """T ≈ mean + c·V/√w with c = (T − mean)√w Vᵀ: the best approximation in the weighted norm, rows left out included."""
+    """T ≈ mean + c·V/√w with c = (T − mean)√w Vᵀ: the best approximation in the weighted norm, rows
+    left out included.
+    """
     matrix, weights = random_matrix(200, 80, 25), np.random.default_rng(1).random(80) + 0.2
     index = np.arange(0, 200, 2)
     basis = fit(matrix, weights, 10, index)
     weighted, squares, vectors = svd(matrix[index], weights)
     mean = matrix[index].mean(axis=0)
-    projection = ((matrix - mean) * np.sqrt(weights) @ vectors[:10].T @ vectors[:10]) / np.sqrt(weights) + mean
+    projection = ((matrix - mean) * np.sqrt(weights) @ vectors[:10].T @ vectors[:10]) / np.sqrt(
+        weights
+    ) + mean
     coefficients = basis.encode(matrix)
     assert coefficients.shape == (200, 10)
     assert relative_l2(basis.reconstruct(coefficients), projection) < 1e-5
 
 
 def test_a_fit_that_has_no_room_is_refused(monkeypatch):
-    """With what is needed and what is left; also when a search for a share of the variance goes on."""
+    """With what is needed and what is left; also when a search for a share of the variance goes
+    on.
+    """
     matrix, weights = random_matrix(2400, 900), np.ones(900)
     with pytest.raises(SettingsError, match="max_memory") as caught:
         fit(matrix, weights, 16, max_bytes=1e6)
@@ -158,11 +176,15 @@ def test_a_fit_that_has_no_room_is_refused(monkeypatch):
 
 @pytest.mark.parametrize("every", [2, 4])
 def test_rows_that_repeat_in_the_order_of_points_are_not_missed(every):
-    """Meshes order their vertices regularly (quads: every fourth is the same corner). Clamped cosines behind random
-    half-spaces, with each `every`-th row alike: the variance that 48 components capture is within 1e-3 of the optimum."""
+    """Meshes order their vertices regularly (quads: every fourth is the same corner). Clamped
+    cosines behind random half-spaces, with each `every`-th row alike: the variance that 48
+    components capture is within 1e-3 of the optimum.
+    """
     rng, lattice = np.random.default_rng(0), Cubemap(16)
     normals, blockers = rng.standard_normal((2, 6000, 3))
-    matrix = np.maximum(normals / np.linalg.norm(normals, axis=1, keepdims=True) @ lattice.vectors.T, 0)
+    matrix = np.maximum(
+        normals / np.linalg.norm(normals, axis=1, keepdims=True) @ lattice.vectors.T, 0
+    )
     matrix *= blockers @ lattice.vectors.T > rng.standard_normal((6000, 1))
     matrix[::every] = matrix[0]
     basis = fit(matrix.astype(np.float32), lattice.solid_angles, 48)
@@ -182,9 +204,13 @@ def test_components_beyond_the_rank_are_left_out(n, s, rank):
 
 @pytest.mark.parametrize(("n", "s"), [(600_000, 60), (100_000, 800)])
 def test_many_points_do_not_lower_the_rank(n, s):
-    """Repeating every row k times multiplies all squared singular values by k and leaves their shares as they were."""
+    """Repeating every row k times multiplies all squared singular values by k and leaves their
+    shares as they were.
+    """
     table, weights = random_matrix(2000, s), np.ones(s)
-    rows = Rows(lambda rows: table[rows % 2000], np.arange(n), SimpleNamespace(solid_angles=weights))
+    rows = Rows(
+        lambda rows: table[rows % 2000], np.arange(n), SimpleNamespace(solid_angles=weights)
+    )
     basis = fit_pca(rows, Target(16)).basis
     _, squares, _ = svd(table, weights)
     assert len(basis.vectors) == 16
@@ -192,9 +218,15 @@ def test_many_points_do_not_lower_the_rank(n, s):
 
 
 def test_degenerate_matrices():
-    """All zero, all rows alike, a single row, no components: an empty basis, and the mean is exact."""
+    """All zero, all rows alike, a single row, no components: an empty basis, and the mean is
+    exact.
+    """
     weights = np.ones(50)
-    for matrix in [np.zeros((9, 50), np.float32), np.full((9, 50), 3.0, np.float32), np.arange(50, dtype=np.float32)[None]]:
+    for matrix in [
+        np.zeros((9, 50), np.float32),
+        np.full((9, 50), 3.0, np.float32),
+        np.arange(50, dtype=np.float32)[None],
+    ]:
         basis = fit(matrix, weights, 4)
         assert basis.vectors.shape == (0, 50) and basis.captured_variance.shape == (0,)
         np.testing.assert_allclose(basis.reconstruct(basis.encode(matrix)), matrix, rtol=1e-6)
@@ -209,7 +241,7 @@ def test_the_same_seed_gives_the_same_basis():
     assert np.linalg.norm(one.vectors @ other.vectors.T) ** 2 > 15.99
 
 
-# --- the mean ------------------------------------------------------------------------------------------------------
+# --- the mean -------------------------------------------------------------------------------------
 
 
 def irradiances(matrix, weights, components, radiance):
@@ -226,18 +258,27 @@ def irradiances(matrix, weights, components, radiance):
 
 
 def test_the_papers_mean_compensation_agrees_where_the_mean_lies_in_the_span():
-    """Non-negative mixtures of five rows: centred, they still span all five, and with them the mean."""
+    """Non-negative mixtures of five rows: centred, they still span all five, and with them the
+    mean.
+    """
     rng = np.random.default_rng(2)
     matrix = (rng.random((100, 5)) @ rng.random((5, 70))).astype(np.float32)
-    weights, radiance = rng.random(70).astype(np.float32) + 0.1, rng.random((70, 3)).astype(np.float32)
+    weights, radiance = (
+        rng.random(70).astype(np.float32) + 0.1,
+        rng.random((70, 3)).astype(np.float32),
+    )
     _, exact, paper, direct = irradiances(matrix, weights, 5, radiance)
     assert relative_l2(exact, direct) < 1e-5 and relative_l2(paper, direct) < 1e-5
 
 
 def test_the_papers_mean_compensation_drops_the_mean_outside_of_the_span():
-    """Its error is the same for all points: the response to light of the mean's part outside the span, predicted here."""
+    """Its error is the same for all points: the response to light of the mean's part outside the
+    span, predicted here.
+    """
     rng = np.random.default_rng(3)
-    matrix = (rng.standard_normal((100, 5)) @ rng.random((5, 70)) + 5 * rng.random(70)).astype(np.float32)
+    matrix = (rng.standard_normal((100, 5)) @ rng.random((5, 70)) + 5 * rng.random(70)).astype(
+        np.float32
+    )
     weights, radiance = rng.random(70) + 0.1, rng.random((70, 3)).astype(np.float32)
     basis, exact, paper, direct = irradiances(matrix, weights, 5, radiance)
     assert relative_l2(exact, direct) < 1e-5
@@ -249,7 +290,7 @@ def test_the_papers_mean_compensation_drops_the_mean_outside_of_the_span():
     np.testing.assert_allclose(exact - paper, np.broadcast_to(predicted, exact.shape), rtol=2e-4)
 
 
-# --- rank and coefficients of scenes -------------------------------------------------------------------------------
+# --- rank and coefficients of scenes --------------------------------------------------------------
 
 
 def maximum_named(caught):
@@ -268,7 +309,8 @@ def test_full_rank_reproduces_the_sampled_transport():
     largest = maximum_named(caught)
     try:
         full = precompute(coefficients=largest)
-    except SettingsError as error:  # points that see the same make the rank lower than the counts tell
+    # points that see the same make the rank lower than the counts tell
+    except SettingsError as error:
         largest = int(str(error).split()[-1])
         full = precompute(coefficients=largest)
     assert len(full.basis.vectors) == largest == full.settings["coefficients"]
@@ -284,7 +326,9 @@ def test_full_rank_reproduces_the_sampled_transport():
 
 
 def test_error_falls_with_coefficients():
-    """Nested subspaces: each more component can only lower the error of the transport, down to what was captured."""
+    """Nested subspaces: each more component can only lower the error of the transport, down to what
+    was captured.
+    """
     errors = []
     for coefficients in (0, 4, 16, 48):
         fitted = precompute(coefficients=coefficients)
@@ -298,7 +342,9 @@ def test_error_falls_with_coefficients():
 
 
 def test_a_scene_of_rank_zero():
-    """A single plane has one row of transport: the default takes no component and loses nothing; more are refused."""
+    """A single plane has one row of transport: the default takes no component and loses nothing;
+    more are refused.
+    """
     flat = precompute(dict(plane=rectangle()))
     assert flat.coefficients.shape == (len(flat.points), 0) and flat.settings["coefficients"] == 0
     np.testing.assert_allclose(flat.irradiance(uniform_sky()), np.pi, rtol=0.01)
@@ -309,10 +355,20 @@ def test_a_scene_of_rank_zero():
 
 @pytest.mark.parametrize(
     "bad",
-    [dict(coefficients=-1), dict(rays_per_direction=0), dict(rays_per_direction=65), dict(seed=-1), dict(directions="cubemap:0"),
-     dict(coefficients="many"), dict(coefficients=2.5), dict(rays_per_direction=1.5), dict(seed="x"), dict(rays_per_direction=None)],
+    [
+        dict(coefficients=-1),
+        dict(rays_per_direction=0),
+        dict(rays_per_direction=65),
+        dict(seed=-1),
+        dict(directions="cubemap:0"),
+        dict(coefficients="many"),
+        dict(coefficients=2.5),
+        dict(rays_per_direction=1.5),
+        dict(seed="x"),
+        dict(rays_per_direction=None),
+    ],
     ids=str,
-)  # fmt: skip
+)
 def test_bad_settings(bad):
     """Also of a wrong type: the caller gets a SettingsError before any work starts."""
     with pytest.raises(SettingsError) as caught:
@@ -320,7 +376,7 @@ def test_bad_settings(bad):
     assert "\n" not in str(caught.value)
 
 
-# --- the file ------------------------------------------------------------------------------------------------------
+# --- the file -------------------------------------------------------------------------------------
 
 
 def test_round_trip(kind, asset, saved):
@@ -333,14 +389,18 @@ def test_round_trip(kind, asset, saved):
     for name in ("positions", "normals", "geometric_normals", "albedo", "areas", "uv", "surface"):
         np.testing.assert_array_equal(getattr(loaded.points, name), getattr(asset.points, name))
     for name in ("levels", "offsets", "nodes", "back"):
-        np.testing.assert_array_equal(getattr(loaded.points.patches, name), getattr(asset.points.patches, name))
+        np.testing.assert_array_equal(
+            getattr(loaded.points.patches, name), getattr(asset.points.patches, name)
+        )
     for name in asset.basis.ARRAYS:
         np.testing.assert_array_equal(getattr(loaded.basis, name), getattr(asset.basis, name))
     np.testing.assert_array_equal(loaded.coefficients, asset.coefficients)
     np.testing.assert_array_equal(loaded.buried, asset.buried)
     for name in ("scene", "settings", "versions", "report"):
         assert getattr(loaded, name) == json.loads(json.dumps(getattr(asset, name)))
-    assert loaded.points.report == asset.points.report and list(loaded.points.surfaces) == list(asset.points.surfaces)
+    assert loaded.points.report == asset.points.report and list(loaded.points.surfaces) == list(
+        asset.points.surfaces
+    )
     assert loaded.directions == asset.directions
     light = np.random.default_rng(0).random((8, 16, 3))
     np.testing.assert_array_equal(loaded.relight(light), asset.relight(light))
@@ -359,8 +419,10 @@ def test_saving_what_was_loaded_gives_the_same_file(saved, tmp_path):
 
 
 def test_the_file_is_enough_for_h5py_and_numpy(asset, saved):
-    """As docs/asset-format.md says: E = max(0, c·(V (L√w)) + Σ w L mean), from the file's datasets alone; where vectors and mean, or
-    coefficients, are of three channels, each for its own channel of light."""
+    """As docs/asset-format.md says: E = max(0, c·(V (L√w)) + Σ w L mean), from the file's datasets
+    alone; where vectors and mean, or coefficients, are of three channels, each for its own channel
+    of light.
+    """
     with h5py.File(saved) as file:
         w = file["directions/solid_angles"][()]
         radiance = np.random.default_rng(1).random((len(w), 3))  # of the cells
@@ -377,7 +439,9 @@ def test_the_file_is_enough_for_h5py_and_numpy(asset, saved):
         assert {"units", "format_version", "scene", "settings", "versions"} <= set(file.attrs)
     expected = asset.irradiance_from(*asset.basis.project_light(radiance.astype(np.float32)))
     assert relative_l2(irradiance, expected) < 1e-5
-    assert w.sum() == pytest.approx(4 * np.pi) and np.allclose(np.linalg.norm(vectors, axis=1), 1, atol=1e-5)
+    assert w.sum() == pytest.approx(4 * np.pi) and np.allclose(
+        np.linalg.norm(vectors, axis=1), 1, atol=1e-5
+    )
 
 
 def test_the_same_seed_gives_the_same_file_within_a_process(kind, saved, tmp_path):
@@ -390,7 +454,7 @@ PROGRAM = """
 import sys, mi_prt
 red = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.8, 0.3, 0.2]}}
 parts = {"type": "scene", "ball": {"type": "sphere", "center": [0, 1, 0], "bsdf": red}, "box": {"type": "cube"}, "extra": {"type": "disk"}}
-asset = mi_prt.precompute.precompute(parts, directions="cubemap:8", edge_length=0.5, indirect=sys.argv[2], paths_per_point=64)
+asset = mi_prt.precompute(parts, directions="cubemap:8", edge_length=0.5, indirect=sys.argv[2], paths_per_point=64)
 assert asset.channels == 3
 asset.save(sys.argv[1])
 """
@@ -398,10 +462,14 @@ asset.save(sys.argv[1])
 
 @pytest.mark.parametrize("indirect", ["solve", "paths"])
 def test_the_same_seed_gives_the_same_file_in_two_processes(tmp_path, indirect):
-    """Another hash seed and addresses; unnamed shapes, whose made-up ids hold an address. Reflections included."""
+    """Another hash seed and addresses; unnamed shapes, whose made-up ids hold an address.
+
+    Reflections included.
+    """
     running = [
         subprocess.Popen(
-            [sys.executable, "-c", PROGRAM, str(tmp_path / f"{i}.prt"), indirect], env=os.environ | {"PYTHONHASHSEED": str(i)}
+            [sys.executable, "-c", PROGRAM, str(tmp_path / f"{i}.prt"), indirect],
+            env=os.environ | {"PYTHONHASHSEED": str(i)},
         )
         for i in (1, 2)
     ]
@@ -420,7 +488,9 @@ def test_a_truncated_file_is_refused(saved, tmp_path, share):
 
 
 def test_damaged_bytes_never_end_in_another_error(saved, tmp_path):
-    """Three random bytes changed, 60 times, mostly in the head where the structure is: loads, or AssetError."""
+    """Three random bytes changed, 60 times, mostly in the head where the structure is: loads, or
+    AssetError.
+    """
     whole, rng = saved.read_bytes(), np.random.default_rng(0)
     for i in range(60):
         damaged = bytearray(whole)
@@ -441,7 +511,9 @@ def changed(saved, path, change):
 
 
 def test_foreign_and_incomplete_files_are_refused(saved, tmp_path):
-    """Missing, a folder, text, another HDF5 file, another version, not finished, a field missing, metadata that is no JSON."""
+    """Missing, a folder, text, another HDF5 file, another version, not finished, a field missing,
+    metadata that is no JSON.
+    """
     (tmp_path / "text.prt").write_text("hello\n" * 100)
     with h5py.File(tmp_path / "foreign.prt", "w") as file:
         file["x"] = [1, 2]
@@ -451,13 +523,23 @@ def test_foreign_and_incomplete_files_are_refused(saved, tmp_path):
         tmp_path / "folder.prt": "folder.prt",
         tmp_path / "text.prt": "text.prt",
         tmp_path / "foreign.prt": "no mi_prt asset",
-        changed(saved, tmp_path / "v.prt", lambda f: f.attrs.__setitem__("format_version", 99)): "version 99",
-        changed(saved, tmp_path / "v0.prt", lambda f: f.attrs.__delitem__("format_version")): "v0.prt",
+        changed(
+            saved, tmp_path / "v.prt", lambda f: f.attrs.__setitem__("format_version", 99)
+        ): "version 99",
+        changed(
+            saved, tmp_path / "v0.prt", lambda f: f.attrs.__delitem__("format_version")
+        ): "v0.prt",
         changed(saved, tmp_path / "i.prt", lambda f: f.attrs.__delitem__("complete")): "incomplete",
         changed(saved, tmp_path / "f.prt", lambda f: f.__delitem__("basis/mean")): "f.prt",
-        changed(saved, tmp_path / "j.prt", lambda f: f.attrs.__setitem__("report", "{no json")): "j.prt",
+        changed(
+            saved, tmp_path / "j.prt", lambda f: f.attrs.__setitem__("report", "{no json")
+        ): "j.prt",
         changed(saved, tmp_path / "n.prt", lambda f: f.attrs.__setitem__("scene", 5)): "n.prt",
-        changed(saved, tmp_path / "d.prt", lambda f: f["directions"].attrs.__setitem__("lattice", "sphere:9")): "d.prt",
+        changed(
+            saved,
+            tmp_path / "d.prt",
+            lambda f: f["directions"].attrs.__setitem__("lattice", "sphere:9"),
+        ): "d.prt",
     }
     for path, message in cases.items():
         with pytest.raises(AssetError, match=message) as caught:
@@ -467,7 +549,14 @@ def test_foreign_and_incomplete_files_are_refused(saved, tmp_path):
 
 @pytest.mark.parametrize(
     "name",
-    ["coefficients", "basis/vectors", "points/positions", "points/buried", "basis/sqrt_weights", "points/patches/nodes"],
+    [
+        "coefficients",
+        "basis/vectors",
+        "points/positions",
+        "points/buried",
+        "basis/sqrt_weights",
+        "points/patches/nodes",
+    ],
 )
 def test_arrays_that_do_not_fit_together_are_refused(saved, tmp_path, name):
     """A file with one array shorter than the others would fail later, or worse, not fail."""
@@ -505,7 +594,9 @@ def test_arrays_of_other_channels_are_refused(kind, saved, tmp_path, channels):
         file.attrs["report"] = json.dumps(json.loads(file.attrs["report"]) | {"channels": channels})
         for name in ["basis/vectors", "basis/mean"] if kind == "reflected" else ["coefficients"]:
             values = file[name][()]
-            one = values.reshape(*values.shape[: values.ndim - 1 - (kind != "direct")], -1, values.shape[-1])[..., :1, :]
+            one = values.reshape(
+                *values.shape[: values.ndim - 1 - (kind != "direct")], -1, values.shape[-1]
+            )[..., :1, :]
             del file[name]
             file[name] = one.repeat(channels, axis=-2)
 
@@ -516,10 +607,14 @@ def test_arrays_of_other_channels_are_refused(kind, saved, tmp_path, channels):
 @pytest.mark.parametrize("report", ["{}", "[]", "3", "null"])
 def test_a_report_that_tells_nothing_is_refused(saved, tmp_path, report):
     with pytest.raises(AssetError, match="odd.prt"):
-        mi_prt.load(changed(saved, tmp_path / "odd.prt", lambda file: file.attrs.__setitem__("report", report)))
+        mi_prt.load(
+            changed(
+                saved, tmp_path / "odd.prt", lambda file: file.attrs.__setitem__("report", report)
+            )
+        )
 
 
-# --- saving --------------------------------------------------------------------------------------------------------
+# --- saving ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -528,7 +623,9 @@ def test_a_report_that_tells_nothing_is_refused(saved, tmp_path, report):
     ids=lambda e: type(e).__name__,
 )
 def test_a_failing_write_leaves_the_old_file(asset, tmp_path, monkeypatch, error):
-    """All or nothing: what was there stays, and no temporary file is left; what a full disk or HDF5 raises is a SettingsError."""
+    """All or nothing: what was there stays, and no temporary file is left; what a full disk or HDF5
+    raises is a SettingsError.
+    """
     path = tmp_path / "old.prt"
     path.write_text("old")
     write, written = h5py.Group.__setitem__, []
@@ -547,7 +644,9 @@ def test_a_failing_write_leaves_the_old_file(asset, tmp_path, monkeypatch, error
 
 @pytest.mark.skipif(sys.platform != "linux", reason="a limit on file sizes stands for a full disk")
 def test_a_full_disk_is_an_error_and_no_crash(saved, tmp_path):
-    """Writes that fail half way, as on a full disk: SettingsError, the old file stays, no temporary file."""
+    """Writes that fail half way, as on a full disk: SettingsError, the old file stays, no temporary
+    file.
+    """
     code = """
 import resource, signal, sys, mi_prt
 asset = mi_prt.load(sys.argv[1])
@@ -560,7 +659,10 @@ except mi_prt.SettingsError:
 """
     (tmp_path / "old.prt").write_bytes(b"old")
     ran = subprocess.run(
-        [sys.executable, "-c", code, str(saved), str(tmp_path / "old.prt")], capture_output=True, text=True, timeout=120
+        [sys.executable, "-c", code, str(saved), str(tmp_path / "old.prt")],
+        capture_output=True,
+        text=True,
+        timeout=120,
     )
     assert (tmp_path / "old.prt").read_bytes() == b"old"
     assert (ran.returncode, ran.stdout.strip()) == (0, "refused"), ran.stderr[-2000:]
@@ -568,7 +670,9 @@ except mi_prt.SettingsError:
 
 
 def test_paths_that_cannot_be_written(asset, tmp_path):
-    """A folder, a folder that is missing, a file in the place of a folder, a name longer than file systems take."""
+    """A folder, a folder that is missing, a file in the place of a folder, a name longer than file
+    systems take.
+    """
     (tmp_path / "file").write_text("x")
     (tmp_path / "folder").mkdir()
     for path in [
@@ -583,7 +687,9 @@ def test_paths_that_cannot_be_written(asset, tmp_path):
     assert sorted(os.listdir(tmp_path)) == ["file", "folder"]
 
 
-@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may write anywhere")
+@pytest.mark.skipif(
+    not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may write anywhere"
+)
 def test_a_folder_without_permission(asset, tmp_path):
     tmp_path.chmod(0o500)
     try:
@@ -600,21 +706,34 @@ def test_saving_over_an_asset_and_to_a_relative_path(asset, tmp_path, monkeypatc
     assert mi_prt.load("a.prt").path == tmp_path / "a.prt" and os.listdir(tmp_path) == ["a.prt"]
 
 
-# --- kernels -------------------------------------------------------------------------------------------------------
+# --- kernels --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("bounces", "indirect"), [(0, "solve"), (2, "solve"), (2, "paths")])
 def test_blocks_share_their_kernels(monkeypatch, bounces, indirect):
-    """What changes from block to block is opaque to the compiler: 80 small blocks do not need 80 kernels.
+    """What changes from block to block is opaque to the compiler: 80 small blocks do not need 80
+    kernels.
 
-    A few there may be: Dr.Jit compiles anew where arrays taken from NumPy happen to be aligned otherwise. And they give the
-    same bits: rays do not know their block.
+    A few there may be: Dr.Jit compiles anew where arrays taken from NumPy happen to be aligned
+    otherwise. And they give the same bits: rays do not know their block.
     """
-    parts = COLOURED | {"inner": sphere((0.2, 0.4, 0), 0.1)}  # inside the box: dark, so that the search for buried points runs
-    settings, traced = dict(directions="cubemap:8", edge_length=0.4, indirect=indirect, bounces=bounces, paths_per_point=32), []
+    # inside the box: dark, so that the search for buried points runs
+    parts = COLOURED | {"inner": sphere((0.2, 0.4, 0), 0.1)}
+    settings, traced = (
+        dict(
+            directions="cubemap:8",
+            edge_length=0.4,
+            indirect=indirect,
+            bounces=bounces,
+            paths_per_point=32,
+        ),
+        [],
+    )
     whole, _ = measure(scene(**parts), **settings)
     monkeypatch.setattr(room, "LANES", 384 * 7)
-    blocked, cost = measure(scene(**parts), None, lambda stage, *_: traced.append(stage), **settings)
+    blocked, cost = measure(
+        scene(**parts), None, lambda stage, *_: traced.append(stage), **settings
+    )
     assert traced.count("transport") > 20 and (bounces == 0 or traced.count("indirect") > 5)
     assert len(whole.points) > 10 * 7 and whole.buried.sum() > 7
     assert cost["kernels"] <= 4
@@ -630,7 +749,9 @@ def test_rays_are_counted(asset):
 
 
 def test_radiance_of_the_default_basis_is_close():
-    """48 components of this scene: within 3 % of the sampled transport under a smooth sky, without bias."""
+    """48 components of this scene: within 3 % of the sampled transport under a smooth sky, without
+    bias.
+    """
     lattice, asset = Cubemap(8), precompute()
     sampled = sample_direct(open_scene(scene(**SMALL)), asset.points, lattice)
     expected = sampled.irradiance(np.ones((len(lattice), 3), np.float32), lattice.solid_angles)

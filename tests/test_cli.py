@@ -40,26 +40,52 @@ def scene(tmp_path_factory):
 @pytest.fixture(scope="module")
 def asset(scene, tmp_path_factory):
     path = tmp_path_factory.mktemp("asset") / "box.prt"
-    mi_prt.precompute.precompute(scene, directions="cubemap:8", coefficients=16, edge_length=0.2).save(path)
+    mi_prt.precompute(scene, directions="cubemap:8", coefficients=16, edge_length=0.2).save(path)
     return path
 
 
 @pytest.mark.parametrize(
     ("options", "bounces", "stages"),
-    [((), range(4, 20), {"indirect"}), (("--bounces", "2"), [2], {"indirect"}), (("--bounces", "0"), [0], {"coefficients"}),
-     (("--bounces", "1", "--indirect", "paths", "--paths-per-point", "16", "--no-denoise"), [1], {"indirect"})],
+    [
+        ((), range(4, 20), {"indirect"}),
+        (("--bounces", "2"), [2], {"indirect"}),
+        (("--bounces", "0"), [0], {"coefficients"}),
+        (
+            ("--bounces", "1", "--indirect", "paths", "--paths-per-point", "16", "--no-denoise"),
+            [1],
+            {"indirect"},
+        ),
+    ],
     ids=lambda x: " ".join(x) if isinstance(x, tuple) else "",
-)  # fmt: skip
-def test_precompute_prints_the_promised_keys_and_nothing_else_on_stdout(scene, tmp_path, capsys, options, bounces, stages):
-    """Without an option it is light after as many reflections as it takes: in a box of albedos of about a half more than four."""
-    code, out, err = run(capsys, "precompute", scene, "-o", tmp_path / "a.prt", *FAST, *options, "--json")
+)
+def test_precompute_prints_the_promised_keys_and_nothing_else_on_stdout(
+    scene, tmp_path, capsys, options, bounces, stages
+):
+    """Without an option it is light after as many reflections as it takes: in a box of albedos of
+    about a half more than four.
+    """
+    code, out, err = run(
+        capsys, "precompute", scene, "-o", tmp_path / "a.prt", *FAST, *options, "--json"
+    )
     result = json.loads(out)
     assert code == 0
     assert set(result) == {
-        "points", "directions", "coefficients", "bounces", "captured_variance", "relative_error", "bytes", "rays", "kernels",
-        "peak_memory_bytes", "seconds",
+        "points",
+        "directions",
+        "coefficients",
+        "bounces",
+        "captured_variance",
+        "relative_error",
+        "bytes",
+        "rays",
+        "kernels",
+        "peak_memory_bytes",
+        "seconds",
     }
-    assert set(result["seconds"]) == {"scene", "points", "transport", "basis", "write", "total"} | stages
+    assert (
+        set(result["seconds"])
+        == {"scene", "points", "transport", "basis", "write", "total"} | stages
+    )
     assert result["bounces"] in bounces
     assert result["directions"] == 384 and result["coefficients"] == 16
     assert result["bytes"] == (tmp_path / "a.prt").stat().st_size
@@ -68,10 +94,15 @@ def test_precompute_prints_the_promised_keys_and_nothing_else_on_stdout(scene, t
 
 @pytest.mark.parametrize("bounces", ["1", "3", "auto"])
 def test_json_is_strict(tmp_path, capsys, bounces):
-    """Between white walls there is no bound of what a few reflections leave out; and infinity is no JSON."""
+    """Between white walls there is no bound of what a few reflections leave out; and infinity is no
+    JSON.
+    """
     wall = """<shape type='rectangle'><transform name='to_world'><translate z='-1'/><rotate {}/></transform>
         <bsdf type='diffuse'><rgb name='reflectance' value='1'/></bsdf></shape>"""
-    walls = "".join(wall.format(f"{axis}='1' angle='{degrees}'") for axis, degrees in (("x", 0), ("x", 90), ("x", -90), ("y", 90), ("y", -90)))
+    walls = "".join(
+        wall.format(f"{axis}='1' angle='{degrees}'")
+        for axis, degrees in (("x", 0), ("x", 90), ("x", -90), ("y", 90), ("y", -90))
+    )
     (tmp_path / "white.xml").write_text(
         f"""<scene version='3.0.0'>{walls}<emitter type='constant'/><sensor type='perspective'><transform name='to_world'>
         <lookat origin='0.1,-0.3,3' target='0,0,0' up='0,0,1'/></transform></sensor></scene>"""
@@ -99,9 +130,25 @@ def test_json_is_strict(tmp_path, capsys, bounces):
 
 def test_relight_writes_every_format(asset, tmp_path, capsys):
     for name, extra in (
-        ("a.exr", ()), ("a.png", ()), ("raster.png", ("--renderer", "raster")), ("a.ply", ()), ("a.npz", ("--rotate", "0,1,1:30")),
+        ("a.exr", ()),
+        ("a.png", ()),
+        ("raster.png", ("--renderer", "raster")),
+        ("a.ply", ()),
+        ("a.npz", ("--rotate", "0,1,1:30")),
     ):
-        code, out, _ = run(capsys, "relight", asset, "-o", tmp_path / name, "--size", "32x24", "--spp", "4", "--json", *extra)
+        code, out, _ = run(
+            capsys,
+            "relight",
+            asset,
+            "-o",
+            tmp_path / name,
+            "--size",
+            "32x24",
+            "--spp",
+            "4",
+            "--json",
+            *extra,
+        )
         result = json.loads(out)
         assert code == 0 and set(result) == {"points", "seconds"}
         assert set(result["seconds"]) == {"project", "relight", "render"}
@@ -112,7 +159,9 @@ def test_relight_writes_every_format(asset, tmp_path, capsys):
 
 
 def test_turning_the_light_once_round_changes_nothing_and_half_way_does(asset, tmp_path, capsys):
-    """A rotation by 360 degrees is the identity; the box is open to one side, so 180 degrees is not."""
+    """A rotation by 360 degrees is the identity; the box is open to one side, so 180 degrees is
+    not.
+    """
     radiance = {}
     for degrees in (0, 180, 360):
         run(capsys, "relight", asset, "-o", tmp_path / "a.npz", "--rotate", f"y:{degrees}")
@@ -122,7 +171,9 @@ def test_turning_the_light_once_round_changes_nothing_and_half_way_does(asset, t
 
 
 def test_compare_prints_the_promised_keys_and_leaves_a_report(asset, tmp_path, capsys):
-    code, out, _ = run(capsys, "compare", asset, "-o", tmp_path / "r", "--size", "64x48", "--spp", "32", "--json")
+    code, out, _ = run(
+        capsys, "compare", asset, "-o", tmp_path / "r", "--size", "64x48", "--spp", "32", "--json"
+    )
     result = json.loads(out)
     assert code == 0
     assert set(result["points"]) >= {"count", "relative_rmse", "bias", "reference_noise"}
@@ -133,7 +184,14 @@ def test_compare_prints_the_promised_keys_and_leaves_a_report(asset, tmp_path, c
     assert 0 < result["bounce_energy_left"] < 1e-3 and 0 < result["indirect_noise"] < 0.02
     names = {path.name for path in (tmp_path / "r").iterdir()}
     assert names == {
-        "report.json", "index.html", "result.exr", "reference.exr", "result.png", "reference.png", "error.png", "flip.png",
+        "report.json",
+        "index.html",
+        "result.exr",
+        "reference.exr",
+        "result.png",
+        "reference.png",
+        "error.png",
+        "flip.png",
         "side_by_side.png",
     }
     assert json.loads((tmp_path / "r" / "report.json").read_text()) == result
@@ -146,7 +204,13 @@ def test_info_of_a_scene_and_of_an_asset(scene, asset, capsys):
     result = json.loads(out)
     assert code == 0
     assert set(result) == {"requires", "settings", "left_out", "predicted"}
-    assert set(result["predicted"]) == {"seconds", "peak_memory_bytes", "bytes", "relighting_bytes", "projection_bytes"}
+    assert set(result["predicted"]) == {
+        "seconds",
+        "peak_memory_bytes",
+        "bytes",
+        "relighting_bytes",
+        "projection_bytes",
+    }
     assert all({"value", "reason"} == set(entry) for entry in result["settings"].values())
     code, out, _ = run(capsys, "info", asset, "--json")
     held = json.loads(out)
@@ -154,16 +218,27 @@ def test_info_of_a_scene_and_of_an_asset(scene, asset, capsys):
     assert held["bounces"] == held["report"]["bounces"] > 4 and held["report"]["channels"] == 3
     energy = held["report"]["bounce_energy"]
     # Each reflection keeps less than the largest albedo of the light.
-    assert len(energy) == held["bounces"] + 1 and all(0 < after < 0.9 * before for before, after in pairwise(energy[1:]))
+    assert len(energy) == held["bounces"] + 1 and all(
+        0 < after < 0.9 * before for before, after in pairwise(energy[1:])
+    )
     assert 0 < held["report"]["bounce_energy_left"] < 2e-3 * sum(energy)
     chosen = held["settings"]
-    assert [chosen[name] for name in ("bounces", "indirect", "paths_per_point", "denoise")] == ["auto", "solve", "auto", True]
+    assert [chosen[name] for name in ("bounces", "indirect", "paths_per_point", "denoise")] == [
+        "auto",
+        "solve",
+        "auto",
+        True,
+    ]
     predicted = result["requires"]["bounce_energy"]
-    assert predicted[0] == pytest.approx(energy[0], rel=0.1) and predicted[1] == pytest.approx(energy[1], rel=0.3)
+    assert predicted[0] == pytest.approx(energy[0], rel=0.1) and predicted[1] == pytest.approx(
+        energy[1], rel=0.3
+    )
 
 
 def test_what_info_predicts_is_what_precompute_needs(scene, tmp_path, capsys):
-    """Points and rays are counted, not guessed, so they agree exactly; bytes to 20 % (the container's own overhead)."""
+    """Points and rays are counted, not guessed, so they agree exactly; bytes to 20 % (the
+    container's own overhead).
+    """
     _, out, _ = run(capsys, "info", scene, *FAST, "--json")
     predicted = json.loads(out)
     _, out, _ = run(capsys, "precompute", scene, "-o", tmp_path / "a.prt", *FAST, "--json")
@@ -188,17 +263,41 @@ def test_same_seed_same_file(scene, tmp_path, capsys):
         (("precompute", "{broken}", "-o", "x.prt"), "Mitsuba rejects"),
         (("precompute", "{empty}", "-o", "x.prt"), "no shapes"),
         (("precompute", "{scene}", "-o", "missing/x.prt"), "does not exist"),
-        (("precompute", "{scene}", "-o", "{folder}/x.prt", "--coefficients", "99999"), "at most 6144"),
-        (("precompute", "{scene}", "-o", "{folder}/x.prt", "--directions", "cubemap:0"), "outside 1…512"),
+        (
+            ("precompute", "{scene}", "-o", "{folder}/x.prt", "--coefficients", "99999"),
+            "at most 6144",
+        ),
+        (
+            ("precompute", "{scene}", "-o", "{folder}/x.prt", "--directions", "cubemap:0"),
+            "outside 1…512",
+        ),
         (("precompute", "{scene}", "-o", "{folder}/x.prt", "--directions", "ball:3"), "cubemap:N"),
-        (("precompute", "{scene}", "-o", "{folder}/x.prt", "--edge-length", "short"), "neither 'auto'"),
+        (
+            ("precompute", "{scene}", "-o", "{folder}/x.prt", "--edge-length", "short"),
+            "neither 'auto'",
+        ),
         (("precompute", "{scene}", "-o", "{folder}/x.prt", "--rays-per-direction", "0"), "1…64"),
-        (("precompute", "{scene}", "-o", "{folder}/x.prt", "--bounces", "many"), "--bounces many is neither"),
+        (
+            ("precompute", "{scene}", "-o", "{folder}/x.prt", "--bounces", "many"),
+            "--bounces many is neither",
+        ),
         (("precompute", "{scene}", "-o", "{folder}/x.prt", "--bounces", "-1"), "auto or 0…10000"),
-        (("precompute", "{scene}", "-o", "{folder}/x.prt", "--bounces", "1", "--basis", "haar"), "direct transport only"),
-        (("precompute", "{scene}", "-o", "{folder}/x.prt", "--indirect", "photons"), "solve or paths"),
-        (("precompute", "{scene}", "-o", "{folder}/x.prt", "--paths-per-point", "3"), "even number 2…65,536"),
-        (("precompute", "{scene}", "-o", "{folder}/x.prt", "--paths-per-point", "few"), "--paths-per-point few is neither"),
+        (
+            ("precompute", "{scene}", "-o", "{folder}/x.prt", "--bounces", "1", "--basis", "haar"),
+            "direct transport only",
+        ),
+        (
+            ("precompute", "{scene}", "-o", "{folder}/x.prt", "--indirect", "photons"),
+            "solve or paths",
+        ),
+        (
+            ("precompute", "{scene}", "-o", "{folder}/x.prt", "--paths-per-point", "3"),
+            "even number 2…65,536",
+        ),
+        (
+            ("precompute", "{scene}", "-o", "{folder}/x.prt", "--paths-per-point", "few"),
+            "--paths-per-point few is neither",
+        ),
         (("info", "{scene}", "--bounces", "2.5"), "--bounces 2.5 is neither"),
         (("precompute", "{scene}", "-o", "{folder}/x.prt", "--threads", "0"), "threads"),
         (("precompute", "{scene}", "-o", "{folder}/x.prt", "-D", "nonsense"), "NAME=VALUE"),
@@ -212,14 +311,26 @@ def test_same_seed_same_file(scene, tmp_path, capsys):
         (("relight", "{asset}", "-o", "{folder}/x.png", "--size", "big"), "WxH"),
         (("relight", "{asset}", "-o", "{folder}/x.png", "--rotate", "y"), "AXIS:DEGREES"),
         (("relight", "{asset}", "-o", "{folder}/x.png", "--rotate", "0,0,0:3"), "no axis"),
-        (("relight", "{asset}", "-o", "{folder}/x.png", "--envmap", "missing.exr"), "does not exist"),
+        (
+            ("relight", "{asset}", "-o", "{folder}/x.png", "--envmap", "missing.exr"),
+            "does not exist",
+        ),
         (("relight", "{asset}", "-o", "{folder}/x.png", "--envmap", "{nan}"), "NaN or infinite"),
         (("relight", "{asset}", "-o", "{folder}/x.png", "--envmap", "{red_green}"), "lacks B"),
-        (("relight", "{asset}", "-o", "{folder}/x.png", "--envmap", "{negative}"), "negative pixels"),
-        (("relight", "{asset}", "-o", "{folder}/x.png", "--renderer", "crayons"), "mitsuba or raster"),
+        (
+            ("relight", "{asset}", "-o", "{folder}/x.png", "--envmap", "{negative}"),
+            "negative pixels",
+        ),
+        (
+            ("relight", "{asset}", "-o", "{folder}/x.png", "--renderer", "crayons"),
+            "mitsuba or raster",
+        ),
         (("compare", "{asset}", "-o", "{folder}/c", "--reference", "hearsay"), "modelled or full"),
         (("compare", "{asset}", "-o", "{asset}"), "cannot be written"),
-        (("compare", "{asset}", "-o", "{folder}/c", "--scene", "{other}"), "not the scene of the asset"),
+        (
+            ("compare", "{asset}", "-o", "{folder}/c", "--scene", "{other}"),
+            "not the scene of the asset",
+        ),
         (("relight",), "Missing argument"),
         (("frobnicate",), "No such command"),
     ],
@@ -238,7 +349,9 @@ def bad_inputs(scene, asset, tmp_path_factory):
     folder = tmp_path_factory.mktemp("bad")
     (folder / "broken.xml").write_text("<scene version='3.0.0'><shape type='sphere'></scene>")
     (folder / "empty.xml").write_text("<scene version='3.0.0'><emitter type='constant'/></scene>")
-    (folder / "other.xml").write_text("<scene version='3.0.0'><shape type='sphere'/><emitter type='constant'/></scene>")
+    (folder / "other.xml").write_text(
+        "<scene version='3.0.0'><shape type='sphere'/><emitter type='constant'/></scene>"
+    )
     (folder / "truncated.prt").write_bytes(asset.read_bytes()[: asset.stat().st_size // 2])
     with h5py.File(folder / "foreign.prt", "w") as file:
         file["x"] = np.zeros(3)
@@ -247,15 +360,23 @@ def bad_inputs(scene, asset, tmp_path_factory):
         changed = pixels.copy()
         changed[3, 4] = value
         OpenEXR.File({}, {"RGB": changed}).write(str(folder / f"{name}.exr"))
-    OpenEXR.File({}, {"R": pixels[..., 0], "G": pixels[..., 0]}).write(str(folder / "red_green.exr"))
-    return {path.stem: path for path in folder.iterdir()} | {"scene": scene, "asset": asset, "folder": folder}
+    OpenEXR.File({}, {"R": pixels[..., 0], "G": pixels[..., 0]}).write(
+        str(folder / "red_green.exr")
+    )
+    return {path.stem: path for path in folder.iterdir()} | {
+        "scene": scene,
+        "asset": asset,
+        "folder": folder,
+    }
 
 
 def test_few_negative_pixels_are_counted_in_a_warning(asset, tmp_path, capsys):
     pixels = np.ones((64, 128, 3), np.float32)
     pixels[30, 4:7] = -1e-3
     OpenEXR.File({}, {"RGB": pixels}).write(str(tmp_path / "sky.exr"))
-    code, _, err = run(capsys, "relight", asset, "-o", tmp_path / "a.npz", "--envmap", tmp_path / "sky.exr")
+    code, _, err = run(
+        capsys, "relight", asset, "-o", tmp_path / "a.npz", "--envmap", tmp_path / "sky.exr"
+    )
     assert code == 0 and "3 negative pixels" in err
 
 
@@ -265,7 +386,18 @@ def test_a_scene_without_light_needs_a_map(tmp_path, capsys):
     code, _, err = run(capsys, "relight", tmp_path / "a.prt", "-o", tmp_path / "a.npz")
     assert code == 2 and "no distant light" in err
     OpenEXR.File({}, {"RGB": np.ones((4, 8, 3), np.float32)}).write(str(tmp_path / "sky.exr"))
-    assert run(capsys, "relight", tmp_path / "a.prt", "-o", tmp_path / "a.npz", "--envmap", tmp_path / "sky.exr")[0] == 0
+    assert (
+        run(
+            capsys,
+            "relight",
+            tmp_path / "a.prt",
+            "-o",
+            tmp_path / "a.npz",
+            "--envmap",
+            tmp_path / "sky.exr",
+        )[0]
+        == 0
+    )
 
 
 def test_a_moved_scene_is_named_and_found_again(scene, tmp_path, capsys):
@@ -275,14 +407,34 @@ def test_a_moved_scene_is_named_and_found_again(scene, tmp_path, capsys):
     (tmp_path / "here").rename(moved)
     code, _, err = run(capsys, "relight", tmp_path / "a.prt", "-o", tmp_path / "a.npz")
     assert code == 2 and "not there any more" in err and "--scene" in err
-    code, _, _ = run(capsys, "relight", tmp_path / "a.prt", "-o", tmp_path / "a.npz", "--scene", moved / "box.xml")
+    code, _, _ = run(
+        capsys,
+        "relight",
+        tmp_path / "a.prt",
+        "-o",
+        tmp_path / "a.npz",
+        "--scene",
+        moved / "box.xml",
+    )
     assert code == 0
 
 
 def test_interrupting_leaves_only_what_can_be_continued(scene, tmp_path):
-    """SIGINT while rays are traced: exit code 130, no asset, no traceback, a word on how to go on; the folder of the run, from which it goes on."""
-    command = [sys.executable, "-m", "mi_prt", "precompute", str(scene), "-o", str(tmp_path / "a.prt")]
-    process = subprocess.Popen([*command, "--rays-per-direction", "64"], stderr=subprocess.PIPE, text=True)
+    """SIGINT while rays are traced: exit code 130, no asset, no traceback, a word on how to go on;
+    the folder of the run, from which it goes on.
+    """
+    command = [
+        sys.executable,
+        "-m",
+        "mi_prt",
+        "precompute",
+        str(scene),
+        "-o",
+        str(tmp_path / "a.prt"),
+    ]
+    process = subprocess.Popen(
+        [*command, "--rays-per-direction", "64"], stderr=subprocess.PIPE, text=True
+    )
     time.sleep(4)
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=60)

@@ -35,7 +35,7 @@ def read(path):
 
 @pytest.fixture(scope="module")
 def room():
-    return mi_prt.precompute.precompute(lit_room(), directions="cubemap:16", edge_length=0.2)
+    return mi_prt.precompute(lit_room(), directions="cubemap:16", edge_length=0.2)
 
 
 @pytest.fixture(scope="module")
@@ -46,14 +46,21 @@ def whole(room, tmp_path_factory):
 
 
 def test_the_reference_is_the_scene_as_modelled_or_as_written(room, whole, tmp_path):
-    """As modelled the bulb is dark and the plastic diffuse, so the result is right; as written it lacks their light.
+    """As modelled the bulb is dark and the plastic diffuse, so the result is right; as written it
+    lacks their light.
 
-    The bulb gives the floor about as much irradiance as a third of the sky's π, far more than the tolerance of 2 %.
+    The bulb gives the floor about as much irradiance as a third of the sky's π, far more than the
+    tolerance of 2 %.
     """
-    reports = {"modelled": whole[0], "full": mi_prt.compare(room, tmp_path / "full", scene=lit_room(), spp=64, reference="full")}
+    reports = {
+        "modelled": whole[0],
+        "full": mi_prt.compare(room, tmp_path / "full", scene=lit_room(), spp=64, reference="full"),
+    }
     for name, report in reports.items():
         assert report["reference"] == name
-        assert {"RoughPlastic", "PointLight"} <= {entry["what"].split(":")[0] for entry in report["left_out"]}
+        assert {"RoughPlastic", "PointLight"} <= {
+            entry["what"].split(":")[0] for entry in report["left_out"]
+        }
     assert abs(reports["modelled"]["points"]["bias"]) < 0.02
     assert abs(reports["modelled"]["image"]["bias"]) < 0.03
     assert reports["full"]["points"]["bias"] < -0.1
@@ -63,13 +70,31 @@ def test_the_reference_is_the_scene_as_modelled_or_as_written(room, whole, tmp_p
 
 @pytest.mark.parametrize(("bounces", "indirect"), [(0, "solve"), (1, "solve"), (1, "paths")])
 def test_the_reference_has_the_reflections_that_were_asked_for(whole, tmp_path, bounces, indirect):
-    """Then the result is right, by the tolerances of above, and the report says what both sides have. Of the picture's light the
-    reflections are 3.6 %, and those after the first 0.5 %; five renders with other seeds differ by 0.06 %."""
-    settings = dict(directions="cubemap:16", edge_length=0.2, bounces=bounces, indirect=indirect, paths_per_point=256)
-    report = mi_prt.compare(mi_prt.precompute.precompute(lit_room(), **settings), tmp_path, scene=lit_room(), spp=64)
-    assert (report["bounces"], report["reference_bounces"], report["bounce_energy_left"]) == (bounces, bounces, 0)
+    """Then the result is right, by the tolerances of above, and the report says what both sides
+    have. Of the picture's light the reflections are 3.6 %, and those after the first 0.5 %; five
+    renders with other seeds differ by 0.06 %.
+    """
+    settings = dict(
+        directions="cubemap:16",
+        edge_length=0.2,
+        bounces=bounces,
+        indirect=indirect,
+        paths_per_point=256,
+    )
+    report = mi_prt.compare(
+        mi_prt.precompute(lit_room(), **settings), tmp_path, scene=lit_room(), spp=64
+    )
+    assert (report["bounces"], report["reference_bounces"], report["bounce_energy_left"]) == (
+        bounces,
+        bounces,
+        0,
+    )
     most, folder = whole
-    assert most["bounces"] > 1 and most["reference_bounces"] == "any number" and 0 < most["bounce_energy_left"] < 1e-3
+    assert (
+        most["bounces"] > 1
+        and most["reference_bounces"] == "any number"
+        and 0 < most["bounce_energy_left"] < 1e-3
+    )
     assert report["indirect_noise"] < (0.02 if indirect == "solve" else 0.1)
     assert abs(report["points"]["bias"]) < 0.02 and abs(report["image"]["bias"]) < 0.03
     less = np.sum(read(tmp_path / "reference.exr")) / np.sum(read(folder / "reference.exr")) - 1
@@ -78,28 +103,45 @@ def test_the_reference_has_the_reflections_that_were_asked_for(whole, tmp_path, 
 
 
 def test_buried_points_are_not_compared(room, whole):
-    """No picture shows them, and they have no light of their own: 64 of the points, on the floor under the box."""
+    """No picture shows them, and they have no light of their own: 64 of the points, on the floor
+    under the box.
+    """
     report, _ = whole
-    assert room.buried.sum() > 40 and report["points"]["count"] == len(room.points) - room.buried.sum() < 4096
+    assert (
+        room.buried.sum() > 40
+        and report["points"]["count"] == len(room.points) - room.buried.sum() < 4096
+    )
 
 
 def test_reported_errors_are_those_of_the_pictures(whole):
-    """The EXRs it leaves give the reported relative RMSE; pixels that no surface covers do not count."""
+    """The EXRs it leaves give the reported relative RMSE; pixels that no surface covers do not
+    count.
+    """
     report, folder = whole
     result, reference = read(folder / "result.exr"), read(folder / "reference.exr")
-    sky = np.abs(reference - 1).max(axis=2) < 1e-6  # the background is exactly the sky's radiance of 1
+    # the background is exactly the sky's radiance of 1
+    sky = np.abs(reference - 1).max(axis=2) < 1e-6
     assert 0.1 < sky.mean() < 0.9
-    assert metrics.relative_rmse(result, reference) < report["image"]["relative_rmse"] + 1e-6  # the background adds no error
-    inside = ~(sky | np.roll(sky, 1, 0) | np.roll(sky, -1, 0) | np.roll(sky, 1, 1) | np.roll(sky, -1, 1))
-    assert metrics.relative_rmse(result[inside], reference[inside]) == pytest.approx(report["image"]["relative_rmse"], rel=0.15)
+    # the background adds no error
+    assert metrics.relative_rmse(result, reference) < report["image"]["relative_rmse"] + 1e-6
+    inside = ~(
+        sky | np.roll(sky, 1, 0) | np.roll(sky, -1, 0) | np.roll(sky, 1, 1) | np.roll(sky, -1, 1)
+    )
+    assert metrics.relative_rmse(result[inside], reference[inside]) == pytest.approx(
+        report["image"]["relative_rmse"], rel=0.15
+    )
 
 
 def test_another_light_and_its_rotation_reach_both_sides(room, tmp_path):
-    """Result and reference are lit by the same turned map: unbiased, and not what the map gives unturned."""
+    """Result and reference are lit by the same turned map: unbiased, and not what the map gives
+    unturned.
+    """
     pixels = np.full((16, 32, 3), 0.1, np.float32)
     pixels[3:7, 2:8] = 5
     reports = [
-        mi_prt.compare(room, tmp_path / str(i), light=pixels, rotate=rotate, scene=lit_room(), spp=64)
+        mi_prt.compare(
+            room, tmp_path / str(i), light=pixels, rotate=rotate, scene=lit_room(), spp=64
+        )
         for i, rotate in enumerate([None, ("y", 140)])
     ]
     assert all(abs(report["points"]["bias"]) < 0.02 for report in reports)
@@ -108,7 +150,9 @@ def test_another_light_and_its_rotation_reach_both_sides(room, tmp_path):
 
 
 def test_errors_of_known_arrays():
-    """By hand: ‖(1, −1)‖/‖(3, 4)‖ = √2/5; sums 7 and 7 have no bias; a tenth of grey in all pixels is 20 dB."""
+    """By hand: ‖(1, −1)‖/‖(3, 4)‖ = √2/5; sums 7 and 7 have no bias; a tenth of grey in all pixels
+    is 20 dB.
+    """
     assert metrics.relative_rmse([4.0, 3.0], [3.0, 4.0]) == pytest.approx(2**0.5 / 5)
     assert metrics.relative_bias([4.0, 3.0], [3.0, 4.0]) == 0
     assert metrics.relative_bias([2.0], [4.0]) == -0.5

@@ -1,14 +1,12 @@
-"""Direction lattices and distant light: partitions of the sphere, exact energy, Mitsuba's conventions, bad input."""
+"""Direction lattices and distant light: partitions of the sphere, exact energy, Mitsuba's
+conventions, bad input.
+"""
 
 import warnings
 
 import numpy as np
 import OpenEXR
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-
-import mi_prt
 from conftest import (
     bias,
     emitted,
@@ -21,14 +19,18 @@ from conftest import (
     uniform_directions,
     uniform_sky,
 )
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import mi_prt
 from mi_prt import DirectionalLight, EnvironmentMap, Light, LightError, LightWarning, SettingsError
 from mi_prt.directions import Cubemap, parse_directions
 from mi_prt.lighting.cells import cell_radiance
 from mi_prt.lighting.environment import rotation_matrix
 from mi_prt.lighting.light import as_light
 from mi_prt.lighting.scene_light import lit_scene, scene_light
-from mi_prt.system.runtime import mitsuba
 from mi_prt.scene.scene import open_scene
+from mi_prt.system.runtime import mitsuba
 
 mi = mitsuba()
 
@@ -42,8 +44,9 @@ def energy_of(light, lattice=LATTICE):
 def exact_energy(pixels):
     """∫ L dω of Mitsuba's bilinear map, in closed form.
 
-    Across, the mean of a row counts. Along θ each row is a hat over [θ−Δ, θ+Δ], Δ = π/(h−1), times sin θ: it integrates
-    to 2 sin θ (1 − cos Δ)/Δ, and at the poles, where half a hat is left, to 1 − sin Δ/Δ.
+    Across, the mean of a row counts. Along θ each row is a hat over [θ−Δ, θ+Δ], Δ = π/(h−1), times
+    sin θ: it integrates to 2 sin θ (1 − cos Δ)/Δ, and at the poles, where half a hat is left, to 1
+    − sin Δ/Δ.
     """
     height = len(pixels)
     step = np.pi / (height - 1)
@@ -52,12 +55,14 @@ def exact_energy(pixels):
     return 2 * np.pi * rows @ pixels.astype(np.float64).mean(axis=1)
 
 
-# --- lattices ------------------------------------------------------------------------------------------------------
+# --- lattices -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("resolution", [1, 2, 5, 32, 64])
 def test_cells_partition_the_sphere(resolution):
-    """Solid angles sum to 4π, vectors are unit, distinct, and the first moment ∫ ω dω is zero by symmetry."""
+    """Solid angles sum to 4π, vectors are unit, distinct, and the first moment ∫ ω dω is zero by
+    symmetry.
+    """
     lattice = Cubemap(resolution)
     assert len(lattice) == len(lattice.vectors) == len(lattice.solid_angles) == 6 * resolution**2
     assert lattice.solid_angles.sum() == pytest.approx(4 * np.pi, rel=1e-12)
@@ -70,7 +75,9 @@ def test_cells_partition_the_sphere(resolution):
 @pytest.mark.parametrize("resolution", [1, 2, 7])
 @pytest.mark.parametrize("rays", [1, 6])
 def test_the_lattice_is_symmetric_about_the_origin(resolution, rays):
-    """Cell j + s/2 is the antipode of cell j, ray by ray: tracing only one of each pair relies on it."""
+    """Cell j + s/2 is the antipode of cell j, ray by ray: tracing only one of each pair relies on
+    it.
+    """
     vectors, fractions = Cubemap(resolution).subdivided(rays)
     half = len(vectors) // 2
     np.testing.assert_allclose(vectors[half:], -vectors[:half], atol=1e-7)
@@ -79,7 +86,9 @@ def test_the_lattice_is_symmetric_about_the_origin(resolution, rays):
 
 @pytest.mark.parametrize("resolution", [1, 3, 8])
 def test_solid_angles_are_the_share_of_random_directions(resolution):
-    """Uniform directions fall into cells in proportion to their solid angles: χ² test, 1e-6 false positives, fixed seed."""
+    """Uniform directions fall into cells in proportion to their solid angles: χ² test, 1e-6 false
+    positives, fixed seed.
+    """
     import scipy.stats
 
     lattice, count = Cubemap(resolution), 400_000
@@ -90,14 +99,19 @@ def test_solid_angles_are_the_share_of_random_directions(resolution):
 
 
 def test_second_moment_of_the_lattice():
-    """∫ ωωᵀ dω = 4π/3 · 1: what a lattice that uses n of n² directions fails. Midpoint error ~ (cell/2)²."""
+    """∫ ωωᵀ dω = 4π/3 · 1: what a lattice that uses n of n² directions fails.
+
+    Midpoint error ~ (cell/2)².
+    """
     lattice = Cubemap(32)
     moment = np.einsum("s,si,sj->ij", lattice.solid_angles, lattice.vectors, lattice.vectors)
     np.testing.assert_allclose(moment, 4 * np.pi / 3 * np.eye(3), atol=2e-3)
 
 
 def test_cells_of_axes_edges_corners_and_any_length():
-    """Directions on the borders of faces belong to a cell that touches them; length does not matter, signed zero neither."""
+    """Directions on the borders of faces belong to a cell that touches them; length does not
+    matter, signed zero neither.
+    """
     lattice = Cubemap(4)
     signs = np.stack(np.meshgrid(*[[-1.0, 0.0, -0.0, 1.0]] * 3), axis=-1).reshape(-1, 3)
     vectors = signs[np.abs(signs).any(axis=1)]
@@ -111,8 +125,9 @@ def test_cells_of_axes_edges_corners_and_any_length():
 @given(st.integers(1, 24), st.integers(0, 2**32 - 1))
 @settings(max_examples=30, deadline=None)
 def test_a_direction_is_never_farther_from_its_cells_centre_than_the_cells_radius(resolution, seed):
-    """Cells are h = π/(4N) wide on either side of their centre; at a corner of the cube, where they are sheared most, the
-    metric makes the diagonal √(8/3) h long, and less elsewhere."""
+    """Cells are h = π/(4N) wide on either side of their centre; at a corner of the cube, where they
+    are sheared most, the metric makes the diagonal √(8/3) h long, and less elsewhere.
+    """
     vectors = uniform_directions(np.random.default_rng(seed), 200)
     lattice = Cubemap(resolution)
     cosine = (lattice.vectors[lattice.cells(vectors)] * vectors).sum(axis=1)
@@ -121,27 +136,41 @@ def test_a_direction_is_never_farther_from_its_cells_centre_than_the_cells_radiu
 
 @pytest.mark.parametrize("rays", [1, 2, 3, 4, 7, 12, 16, 64])
 def test_subdivision(rays):
-    """Sub-cells partition their cell: shares sum to 1, vectors are distinct and in the cell, and the first moment of a
-    cell is the share-weighted mean of theirs, which converges to the exact one."""
+    """Sub-cells partition their cell: shares sum to 1, vectors are distinct and in the cell, and
+    the first moment of a cell is the share-weighted mean of theirs, which converges to the exact
+    one.
+    """
     lattice = Cubemap(4)
     vectors, fractions = lattice.subdivided(rays)
     assert vectors.shape == (96, rays, 3) and fractions.shape == (96, rays)
     np.testing.assert_allclose(fractions.sum(axis=1), 1, atol=1e-6)
     assert fractions.min() > 0
-    np.testing.assert_array_equal(lattice.cells(vectors.reshape(-1, 3)), np.repeat(np.arange(96), rays))
+    np.testing.assert_array_equal(
+        lattice.cells(vectors.reshape(-1, 3)), np.repeat(np.arange(96), rays)
+    )
     assert len(np.unique(vectors.reshape(-1, 3), axis=0)) == 96 * rays
-    # Exact: ∫_cube-face-cell ω dω by 64 × 64 midpoints of the plane, dω = 1/(1 + a² + b²)^{3/2} da db.
+    # Exact: ∫_cube-face-cell ω dω by 64 × 64 midpoints of the plane, dω = 1/(1 + a² + b²)^{3/2} da
+    # db.
     if rays == 64:
         edges = np.tan(np.pi / 4 * np.linspace(-1, 1, 5))
-        a = np.concatenate([np.linspace(l, h, 129)[1::2] for l, h in zip(edges, edges[1:])]).reshape(4, 64)
+        a = np.concatenate(
+            [np.linspace(l, h, 129)[1::2] for l, h in zip(edges, edges[1:])]
+        ).reshape(4, 64)
         widths = np.diff(edges) / 64
         aa, bb = a[1][None, :], a[0][:, None]
         density = widths[1] * widths[0] / (1 + aa**2 + bb**2) ** 1.5
         mean = np.array(
-            [(aa * density / np.sqrt(1 + aa**2 + bb**2)).sum(), (bb * density / np.sqrt(1 + aa**2 + bb**2)).sum()]
+            [
+                (aa * density / np.sqrt(1 + aa**2 + bb**2)).sum(),
+                (bb * density / np.sqrt(1 + aa**2 + bb**2)).sum(),
+            ]
         )
-        (cell,) = lattice.cells(np.array([[np.tan(np.pi / 4 * -0.25), np.tan(np.pi / 4 * -0.75), 1.0]]))
-        ours = (fractions[cell, :, None] * vectors[cell]).sum(axis=0)[:2] * lattice.solid_angles[cell]
+        (cell,) = lattice.cells(
+            np.array([[np.tan(np.pi / 4 * -0.25), np.tan(np.pi / 4 * -0.75), 1.0]])
+        )
+        ours = (fractions[cell, :, None] * vectors[cell]).sum(axis=0)[:2] * lattice.solid_angles[
+            cell
+        ]
         np.testing.assert_allclose(ours, mean, rtol=1e-3)
 
 
@@ -167,33 +196,44 @@ def test_bad_lattice_names(text):
     assert "\n" not in str(caught.value)
 
 
-# --- energy --------------------------------------------------------------------------------------------------------
+# --- energy ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("shape", [(2, 4), (3, 5), (9, 16), (17, 34), (64, 128), (512, 1024)])
 @pytest.mark.parametrize("resolution", [4, 32])
 def test_energy_of_a_map_is_exact(shape, resolution):
-    """Σ_j w_j L_j = ∫ L dω of the bilinear map, in closed form, to 1e-4: noise of all sizes, turned by a random angle."""
+    """Σ_j w_j L_j = ∫ L dω of the bilinear map, in closed form, to 1e-4: noise of all sizes, turned
+    by a random angle.
+    """
     rng = np.random.default_rng(shape)
     pixels = rng.exponential(size=(*shape, 3)).astype(np.float32) * [1, 1e-3, 1e3]
     light = EnvironmentMap(pixels, rotation=random_rotation(rng))
-    np.testing.assert_allclose(energy_of(light, Cubemap(resolution)), exact_energy(light.pixels), rtol=1e-4)
+    np.testing.assert_allclose(
+        energy_of(light, Cubemap(resolution)), exact_energy(light.pixels), rtol=1e-4
+    )
 
 
 @pytest.mark.parametrize(
-    ("shape", "row"), [((9, 16), 3), ((17, 34), 5), ((64, 128), 0), ((64, 128), 63), ((512, 1024), 200)]
+    ("shape", "row"),
+    [((9, 16), 3), ((17, 34), 5), ((64, 128), 0), ((64, 128), 63), ((512, 1024), 200)],
 )
 @pytest.mark.parametrize("resolution", [4, 32])
 def test_energy_of_a_sun_of_a_single_pixel_is_exact(shape, row, resolution):
-    """A pixel of 1e5 in a sky of 1 is neither missed nor counted at its peak: 1e-4 as above, also at the poles."""
+    """A pixel of 1e5 in a sky of 1 is neither missed nor counted at its peak: 1e-4 as above, also
+    at the poles.
+    """
     pixels = np.ones((*shape, 3), np.float32)
     pixels[row, shape[1] // 3] = [1e5, 3e4, 1.0]
     light = EnvironmentMap(pixels, rotation=random_rotation(np.random.default_rng(row)))
-    np.testing.assert_allclose(energy_of(light, Cubemap(resolution)), exact_energy(pixels), rtol=1e-4)
+    np.testing.assert_allclose(
+        energy_of(light, Cubemap(resolution)), exact_energy(pixels), rtol=1e-4
+    )
 
 
 def test_a_sun_lands_in_its_cells_and_leaves_the_others():
-    """Only the cells that the pixel's hat reaches (one pixel around it) may differ from the sky around."""
+    """Only the cells that the pixel's hat reaches (one pixel around it) may differ from the sky
+    around.
+    """
     pixels = np.ones((64, 128, 3), np.float32)
     pixels[20, 40] = 1e5
     rotation = random_rotation(np.random.default_rng(2))
@@ -209,17 +249,27 @@ def test_a_sun_lands_in_its_cells_and_leaves_the_others():
 @pytest.mark.parametrize("shape", [(2, 4), (1, 1), (7, 3), (100, 200)])
 @pytest.mark.parametrize("resolution", [1, 5, 32])
 def test_a_constant_map_is_constant_in_each_cell(shape, resolution):
-    """The mean of a constant is the constant, under any rotation; the correction may cost no more than float32."""
-    light = EnvironmentMap(np.full((*shape, 3), [0.1, 1.0, 1e4]), rotation=random_rotation(np.random.default_rng(4)))
-    np.testing.assert_allclose(cell_radiance(light, Cubemap(resolution)) / [0.1, 1.0, 1e4], 1, rtol=1e-5)
+    """The mean of a constant is the constant, under any rotation; the correction may cost no more
+    than float32.
+    """
+    light = EnvironmentMap(
+        np.full((*shape, 3), [0.1, 1.0, 1e4]), rotation=random_rotation(np.random.default_rng(4))
+    )
+    np.testing.assert_allclose(
+        cell_radiance(light, Cubemap(resolution)) / [0.1, 1.0, 1e4], 1, rtol=1e-5
+    )
 
 
 def test_cells_hold_the_mean_over_their_solid_angle():
-    """A smooth map: each cell's mean is its function's at 256 sub-cells, which the map interpolates to 1e-3."""
+    """A smooth map: each cell's mean is its function's at 256 sub-cells, which the map interpolates
+    to 1e-3.
+    """
     lattice = Cubemap(8)
-    function = lambda d: np.stack([1 + d[:, 0], 1 + d[:, 1] ** 2, np.exp(d[:, 2])], axis=-1)  # noqa: E731
+    function = lambda d: np.stack([1 + d[:, 0], 1 + d[:, 1] ** 2, np.exp(d[:, 2])], axis=-1)
     vectors, fractions = lattice.subdivided(64)
-    expected = np.einsum("sr,src->sc", fractions, function(vectors.reshape(-1, 3)).reshape(len(lattice), 64, 3))
+    expected = np.einsum(
+        "sr,src->sc", fractions, function(vectors.reshape(-1, 3)).reshape(len(lattice), 64, 3)
+    )
     result = cell_radiance(sky_of(function, 256), lattice)
     assert relative_l2(result, expected) < 1e-3
     assert np.abs(bias(result, expected)) < 1e-4
@@ -230,14 +280,18 @@ def test_directional_light_keeps_its_irradiance():
     toward = np.array([0.3, -0.5, 0.7])
     radiance = cell_radiance(DirectionalLight(-5 * toward, [1.0, 2.0, 3.0]), LATTICE)
     assert np.flatnonzero(radiance.any(axis=1)).tolist() == LATTICE.cells(toward[None]).tolist()
-    np.testing.assert_allclose((radiance * LATTICE.solid_angles[:, None]).sum(axis=0), [1, 2, 3], rtol=1e-6)
+    np.testing.assert_allclose(
+        (radiance * LATTICE.solid_angles[:, None]).sum(axis=0), [1, 2, 3], rtol=1e-6
+    )
 
 
-# --- Mitsuba's convention ------------------------------------------------------------------------------------------
+# --- Mitsuba's convention -------------------------------------------------------------------------
 
 
 def interpolated(light, directions):
-    """Radiance of an EnvironmentMap at directions, from the quadrature's nearest sample; error ~ gradient × spacing."""
+    """Radiance of an EnvironmentMap at directions, from the quadrature's nearest sample; error ~
+    gradient × spacing.
+    """
     import scipy.spatial
 
     parts = list(light.quadrature(0.004))
@@ -247,15 +301,22 @@ def interpolated(light, directions):
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_quadrature_equals_mitsubas_envmap(seed):
-    """At each sample's own direction Mitsuba's emitter shows the same radiance, under a random to_world and scale.
+    """At each sample's own direction Mitsuba's emitter shows the same radiance, under a random
+    to_world and scale.
 
-    Equal up to float32 in the directions: 1e-6 rad of a gradient of at most a pixel's step per pixel.
+    Equal up to float32 in the directions: 1e-6 rad of a gradient of at most a pixel's step per
+    pixel.
     """
     rng = np.random.default_rng(seed)
     pixels = rng.random((12, 24, 3)).astype(np.float32)
     rotation = random_rotation(rng)
     emitter = mi.load_dict(
-        {"type": "envmap", "bitmap": mi.Bitmap(pixels), "to_world": matrix_transform(rotation), "scale": 0.7}
+        {
+            "type": "envmap",
+            "bitmap": mi.Bitmap(pixels),
+            "to_world": matrix_transform(rotation),
+            "scale": 0.7,
+        }
     )
     for light in (
         EnvironmentMap(pixels, rotation, scale=0.7),
@@ -264,7 +325,10 @@ def test_quadrature_equals_mitsubas_envmap(seed):
         total = 0
         for vectors, solid_angles, radiance in light.quadrature(0.05, band=5000):
             seen = emitted(emitter, vectors)
-            assert np.quantile(np.abs(radiance - seen), 0.999) < 2e-5 and np.abs(radiance - seen).max() < 1e-3
+            assert (
+                np.quantile(np.abs(radiance - seen), 0.999) < 2e-5
+                and np.abs(radiance - seen).max() < 1e-3
+            )
             total += solid_angles.sum(dtype=float)
         assert total == pytest.approx(4 * np.pi, rel=1e-6)
 
@@ -279,7 +343,9 @@ def test_a_map_of_one_column_or_row_works_as_in_mitsuba():
 
 @pytest.mark.parametrize("axis", ["x", "y", "z", (1, -2, 0.5)])
 def test_rotated_light_equals_mitsubas_rotated_emitter(axis):
-    """`rotated` turns light as Mitsuba's to_world = rotate(axis, angle) @ to_world does, in world space."""
+    """`rotated` turns light as Mitsuba's to_world = rotate(axis, angle) @ to_world does, in world
+    space.
+    """
     rng = np.random.default_rng(8)
     pixels = sky_of(lambda d: np.exp(d @ rng.standard_normal((3, 3))), 32)
     start, degrees = random_rotation(rng), 77.0
@@ -293,7 +359,9 @@ def test_rotated_light_equals_mitsubas_rotated_emitter(axis):
 
 
 def test_rotating_light_of_all_kinds_together():
-    """A Light turns all its parts; a directional light turned by `rotated` comes from the turned direction."""
+    """A Light turns all its parts; a directional light turned by `rotated` comes from the turned
+    direction.
+    """
     sun = DirectionalLight([0, 0, -1.0], [1, 1, 1])  # from +z
     both = Light((EnvironmentMap(uniform_sky()),), (sun,)).rotated("y", 90)  # +z to +x
     np.testing.assert_allclose(both.directionals[0].direction, [-1, 0, 0], atol=1e-12)
@@ -301,22 +369,30 @@ def test_rotating_light_of_all_kinds_together():
 
 
 def test_rotations_compose_and_keep_the_map():
-    """Turning by a then b is one rotation matrix; 360° is none; pixels and the original are untouched."""
+    """Turning by a then b is one rotation matrix; 360° is none; pixels and the original are
+    untouched.
+    """
     light = EnvironmentMap(np.random.default_rng(0).random((4, 8, 3)), scale=2.0)
     turned = light.rotated("x", 30).rotated("z", -50)
-    np.testing.assert_allclose(turned.rotation, rotation_matrix("z", -50) @ rotation_matrix("x", 30), atol=1e-12)
+    np.testing.assert_allclose(
+        turned.rotation, rotation_matrix("z", -50) @ rotation_matrix("x", 30), atol=1e-12
+    )
     np.testing.assert_array_equal(turned.pixels, light.pixels)
     np.testing.assert_array_equal(light.rotation, np.eye(3))
     np.testing.assert_allclose(light.rotated("y", 360).rotation, np.eye(3), atol=1e-12)
 
 
 def test_prepared_light_turns_like_the_map():
-    """Light on a fine lattice has the map's energy whatever the angle, keeps a constant, and stays near the exact rotation.
+    """Light on a fine lattice has the map's energy whatever the angle, keeps a constant, and stays
+    near the exact rotation.
 
-    A direction moves by at most the radius of a fine cell, a third of a coarse one's, so that a smooth sky hardly changes.
+    A direction moves by at most the radius of a fine cell, a third of a coarse one's, so that a
+    smooth sky hardly changes.
     """
-    asset = mi_prt.precompute.precompute(scene(ball=sphere()), directions="cubemap:16", edge_length=1.0)
-    pixels = sky_of(lambda d: np.exp(2 * d @ np.array([[0.5, 1, 0], [0.5, 0, 1], [0.7, 0, 0.1]])), 64)
+    asset = mi_prt.precompute(scene(ball=sphere()), directions="cubemap:16", edge_length=1.0)
+    pixels = sky_of(
+        lambda d: np.exp(2 * d @ np.array([[0.5, 1, 0], [0.5, 0, 1], [0.7, 0, 0.1]])), 64
+    )
     sun = DirectionalLight([0, -1, 0.2], [1, 1, 1])
     exact = Light((EnvironmentMap(pixels),), (sun,))
     prepared = asset.prepare_light(exact)
@@ -326,22 +402,29 @@ def test_prepared_light_turns_like_the_map():
         np.testing.assert_allclose(energy_of(now), energy_of(then), rtol=1e-4)
         without = [cell_radiance(Light(l.maps), LATTICE) for l in (now, then)]
         assert relative_l2(*without) < 0.02
-        np.testing.assert_allclose(cell_radiance(flat.rotated(axis, degrees), LATTICE) / [1, 2, 3], 1, rtol=1e-3)
+        np.testing.assert_allclose(
+            cell_radiance(flat.rotated(axis, degrees), LATTICE) / [1, 2, 3], 1, rtol=1e-3
+        )
         assert relative_l2(asset.irradiance(now), asset.irradiance(then)) < 5e-3
 
 
 def test_lit_scene_gives_mitsuba_the_same_light():
-    """What `lit_scene` hands to Mitsuba shows the light's radiance in all directions, and its directional lights."""
+    """What `lit_scene` hands to Mitsuba shows the light's radiance in all directions, and its
+    directional lights.
+    """
     rng = np.random.default_rng(6)
     light = Light(
-        (EnvironmentMap(rng.random((8, 16, 3)), random_rotation(rng)),), (DirectionalLight([1, -2, 0.5], [3, 2, 1]),)
+        (EnvironmentMap(rng.random((8, 16, 3)), random_rotation(rng)),),
+        (DirectionalLight([1, -2, 0.5], [3, 2, 1]),),
     )
     lit = lit_scene(mi.load_dict(scene(s=sphere(), old={"type": "constant"})), light)
     again = scene_light(open_scene(lit))
-    np.testing.assert_allclose(cell_radiance(again, LATTICE), cell_radiance(light, LATTICE), rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(
+        cell_radiance(again, LATTICE), cell_radiance(light, LATTICE), rtol=1e-4, atol=1e-5
+    )
 
 
-# --- rotation_matrix -----------------------------------------------------------------------------------------------
+# --- rotation_matrix ------------------------------------------------------------------------------
 
 axes = st.one_of(
     st.sampled_from(["x", "y", "z"]),
@@ -353,9 +436,15 @@ angles = st.floats(-1e4, 1e4)
 @given(axes, angles)
 @settings(max_examples=100, deadline=None)
 def test_rotation_matrices_are_rotations(axis, degrees):
-    """Orthonormal, of determinant 1, with the axis fixed and the angle in the trace: tr R = 1 + 2 cos α."""
+    """Orthonormal, of determinant 1, with the axis fixed and the angle in the trace: tr R = 1 + 2
+    cos α.
+    """
     matrix = rotation_matrix(axis, degrees)
-    vector = {"x": [1, 0, 0], "y": [0, 1, 0], "z": [0, 0, 1]}.get(axis, axis) if isinstance(axis, str) else axis
+    vector = (
+        {"x": [1, 0, 0], "y": [0, 1, 0], "z": [0, 0, 1]}.get(axis, axis)
+        if isinstance(axis, str)
+        else axis
+    )
     np.testing.assert_allclose(matrix @ matrix.T, np.eye(3), atol=1e-9)
     assert np.linalg.det(matrix) == pytest.approx(1, abs=1e-9)
     np.testing.assert_allclose(matrix @ vector, vector, atol=1e-8)
@@ -367,7 +456,9 @@ def test_rotation_matrices_are_rotations(axis, degrees):
 def test_rotations_about_one_axis_add_up_and_can_be_undone(axis, one, two):
     """R(a) R(b) = R(a + b), R(a)ᵀ = R(−a)."""
     np.testing.assert_allclose(
-        rotation_matrix(axis, one) @ rotation_matrix(axis, two), rotation_matrix(axis, one + two), atol=1e-7
+        rotation_matrix(axis, one) @ rotation_matrix(axis, two),
+        rotation_matrix(axis, one + two),
+        atol=1e-7,
     )
     np.testing.assert_allclose(rotation_matrix(axis, one).T, rotation_matrix(axis, -one), atol=1e-9)
 
@@ -375,7 +466,9 @@ def test_rotations_about_one_axis_add_up_and_can_be_undone(axis, one, two):
 def test_rotation_is_right_handed():
     """About +z a quarter turn takes x to y; and cyclically."""
     for axis, start, end in [("z", 0, 1), ("x", 1, 2), ("y", 2, 0)]:
-        np.testing.assert_allclose(rotation_matrix(axis, 90) @ np.eye(3)[start], np.eye(3)[end], atol=1e-12)
+        np.testing.assert_allclose(
+            rotation_matrix(axis, 90) @ np.eye(3)[start], np.eye(3)[end], atol=1e-12
+        )
 
 
 @pytest.mark.parametrize(
@@ -398,7 +491,7 @@ def test_bad_rotations(axis, degrees):
     assert "\n" not in str(caught.value)
 
 
-# --- bad input -----------------------------------------------------------------------------------------------------
+# --- bad input ------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
@@ -452,7 +545,8 @@ def test_arrays_of_the_wrong_shape(shape):
 
 
 @pytest.mark.parametrize(
-    "source", [None, 5, [["a"]], {"a": 1}, np.array([[["x"] * 3]]), np.ones((2, 4, 3), complex), object()]
+    "source",
+    [None, 5, [["a"]], {"a": 1}, np.array([[["x"] * 3]]), np.ones((2, 4, 3), complex), object()],
 )
 def test_things_that_are_no_light(source):
     with pytest.raises(LightError) as caught:
@@ -461,31 +555,50 @@ def test_things_that_are_no_light(source):
 
 
 def write_exr(path, channels):
-    with OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}, channels) as file:
+    with OpenEXR.File(
+        {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}, channels
+    ) as file:
         file.write(str(path))
 
 
 def test_exr_files(tmp_path):
-    """float32 and float16, alpha and other channels, upper-case suffix: the pixels come back as written."""
+    """float32 and float16, alpha and other channels, upper-case suffix: the pixels come back as
+    written.
+    """
     pixels = np.random.default_rng(0).random((6, 12, 3)).astype(np.float32)
     write_exr(tmp_path / "rgb.exr", {"RGB": pixels})
-    write_exr(tmp_path / "half.EXR", {name: pixels[..., i].astype(np.float16).copy() for i, name in enumerate("RGB")})
     write_exr(
-        tmp_path / "more.exr", {"RGBA": np.dstack([pixels, np.ones((6, 12), np.float32)]), "depth.Z": pixels[..., 0].copy()}
+        tmp_path / "half.EXR",
+        {name: pixels[..., i].astype(np.float16).copy() for i, name in enumerate("RGB")},
+    )
+    write_exr(
+        tmp_path / "more.exr",
+        {
+            "RGBA": np.dstack([pixels, np.ones((6, 12), np.float32)]),
+            "depth.Z": pixels[..., 0].copy(),
+        },
     )
     np.testing.assert_array_equal(EnvironmentMap(tmp_path / "rgb.exr").pixels, pixels)
-    np.testing.assert_array_equal(EnvironmentMap(str(tmp_path / "half.EXR")).pixels, pixels.astype(np.float16))
+    np.testing.assert_array_equal(
+        EnvironmentMap(str(tmp_path / "half.EXR")).pixels, pixels.astype(np.float16)
+    )
     np.testing.assert_array_equal(EnvironmentMap(tmp_path / "more.exr").pixels, pixels)
-    np.testing.assert_array_equal(EnvironmentMap(mi.Bitmap(str(tmp_path / "rgb.exr"))).pixels, pixels)
+    np.testing.assert_array_equal(
+        EnvironmentMap(mi.Bitmap(str(tmp_path / "rgb.exr"))).pixels, pixels
+    )
 
 
 def test_other_image_formats(tmp_path):
-    """Radiance HDR holds 8 bits of mantissa for all channels; PNG is sRGB-encoded and becomes linear."""
+    """Radiance HDR holds 8 bits of mantissa for all channels; PNG is sRGB-encoded and becomes
+    linear.
+    """
     pixels = np.random.default_rng(0).random((6, 12, 3)).astype(np.float32) + 0.5
     mi.Bitmap(pixels).write(str(tmp_path / "map.hdr"))
     np.testing.assert_allclose(EnvironmentMap(tmp_path / "map.hdr").pixels, pixels, rtol=0.02)
     mi.Bitmap(np.full((4, 8, 3), 188, np.uint8)).write(str(tmp_path / "map.png"))
-    np.testing.assert_allclose(EnvironmentMap(tmp_path / "map.png").pixels, ((188 / 255 + 0.055) / 1.055) ** 2.4, rtol=1e-3)
+    np.testing.assert_allclose(
+        EnvironmentMap(tmp_path / "map.png").pixels, ((188 / 255 + 0.055) / 1.055) ** 2.4, rtol=1e-3
+    )
 
 
 def test_exr_without_a_channel_names_it(tmp_path):
@@ -499,8 +612,13 @@ def test_exr_without_a_channel_names_it(tmp_path):
 
 
 def test_files_that_cannot_be_read(tmp_path):
-    """Each with a typed error in one line: missing, a folder, text, empty, truncated, and an unknown format."""
-    write_exr(tmp_path / "good.exr", {"RGB": np.random.default_rng(0).random((64, 128, 3)).astype(np.float32)})
+    """Each with a typed error in one line: missing, a folder, text, empty, truncated, and an
+    unknown format.
+    """
+    write_exr(
+        tmp_path / "good.exr",
+        {"RGB": np.random.default_rng(0).random((64, 128, 3)).astype(np.float32)},
+    )
     whole = (tmp_path / "good.exr").read_bytes()
     (tmp_path / "folder.exr").mkdir()
     (tmp_path / "text.exr").write_text("not an image")
@@ -559,9 +677,16 @@ def test_a_mirrored_envmap_follows_mitsuba():
     rng = np.random.default_rng(9)
     pixels = sky_of(lambda d: np.exp(d @ rng.standard_normal((3, 3))), 32)
     mirror = np.diag([-1.0, 1, 1])
-    emitter = mi.load_dict({"type": "envmap", "bitmap": mi.Bitmap(pixels), "to_world": matrix_transform(mirror)})
+    emitter = mi.load_dict(
+        {"type": "envmap", "bitmap": mi.Bitmap(pixels), "to_world": matrix_transform(mirror)}
+    )
     directions = uniform_directions(rng, 300)
-    assert relative_l2(interpolated(EnvironmentMap(pixels, mirror), directions), emitted(emitter, directions)) < 5e-3
+    assert (
+        relative_l2(
+            interpolated(EnvironmentMap(pixels, mirror), directions), emitted(emitter, directions)
+        )
+        < 5e-3
+    )
 
 
 @pytest.mark.parametrize("pixel_format", ["RGB", "RGBA", "Y"])

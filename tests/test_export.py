@@ -1,4 +1,6 @@
-"""Exported points and images: exact round trips through other readers, and files that are whole or not there."""
+"""Exported points and images: exact round trips through other readers, and files that are whole or
+not there.
+"""
 
 from types import SimpleNamespace
 
@@ -9,25 +11,32 @@ from conftest import cube, diffuse, rectangle, scene
 from PIL import Image
 
 from mi_prt.errors import SettingsError
-from mi_prt.points.points import sample_points
 from mi_prt.output import export
+from mi_prt.points.points import sample_points
 from mi_prt.render.display import display, exposure
-from mi_prt.system.runtime import mitsuba
 from mi_prt.scene.scene import open_scene
+from mi_prt.system.runtime import mitsuba
 
 
 @pytest.fixture(scope="module")
 def asset():
-    """Points of a box on a two-sided plate, some buried: all that these functions use of an asset."""
+    """Points of a box on a two-sided plate, some buried: all that these functions use of an
+    asset.
+    """
     plate = rectangle(bsdf={"type": "twosided", "side": diffuse()})
-    points = sample_points(open_scene(scene(box=cube((0, 0.3, 0), 0.3, bsdf=diffuse([0.8, 0.4, 0.2])), plate=plate)), 0.2)
+    points = sample_points(
+        open_scene(scene(box=cube((0, 0.3, 0), 0.3, bsdf=diffuse([0.8, 0.4, 0.2])), plate=plate)),
+        0.2,
+    )
     return SimpleNamespace(points=points, buried=points.positions[:, 1] < 0.01)
 
 
 @pytest.fixture(scope="module")
 def radiance(asset):
     """Values over nine decades: nothing may be clipped or rounded."""
-    return (10 ** np.random.default_rng(0).uniform(-5, 4, asset.points.positions.shape)).astype(np.float32)
+    return (10 ** np.random.default_rng(0).uniform(-5, 4, asset.points.positions.shape)).astype(
+        np.float32
+    )
 
 
 def read_ply(path):
@@ -36,7 +45,9 @@ def read_ply(path):
     header, data = path.read_bytes().split(b"end_header\n", 1)
     lines = [line.split() for line in header.decode().splitlines()]
     vertices, faces = (int(line[2]) for line in lines if line[0] == "element")
-    layout = np.dtype([(line[2], types[line[1]]) for line in lines if line[0] == "property" and line[1] != "list"])
+    layout = np.dtype(
+        [(line[2], types[line[1]]) for line in lines if line[0] == "property" and line[1] != "list"]
+    )
     assert ["property", "list", "uchar", "int", "vertex_indices"] in lines
     vertex = np.frombuffer(data, layout, vertices)
     face = np.frombuffer(data, [("count", "u1"), ("vertices", "<i4", 3)], faces, vertex.nbytes)
@@ -57,20 +68,30 @@ def test_ply_holds_points_and_radiance(asset, radiance, tmp_path):
     np.testing.assert_array_equal(columns(vertex, "radiance_r radiance_g radiance_b"), radiance)
     np.testing.assert_array_equal(face, asset.points.patches.triangles())
     shown = display(radiance, exposure(radiance[~asset.buried]))
-    np.testing.assert_allclose(columns(vertex, "red green blue") / 255, shown, atol=0.5 / 255 + 1e-6)
+    np.testing.assert_allclose(
+        columns(vertex, "red green blue") / 255, shown, atol=0.5 / 255 + 1e-6
+    )
 
 
 def test_mitsuba_reads_the_ply(asset, radiance, tmp_path):
-    """Mitsuba names the attribute after the properties: `radiance_r`, g, b become `vertex_radiance_color`."""
+    """Mitsuba names the attribute after the properties: `radiance_r`, g, b become
+    `vertex_radiance_color`.
+    """
     mi = mitsuba()
     path = tmp_path / "points.ply"
     export.write_ply(path, asset, radiance)
     mesh = mi.load_dict({"type": "ply", "filename": str(path)})
     parameters = mi.traverse(mesh)
     np.testing.assert_array_equal(np.array(parameters["vertex_radiance_color"]), radiance.ravel())
-    np.testing.assert_array_equal(np.array(parameters["vertex_positions"]), asset.points.positions.ravel())
-    np.testing.assert_array_equal(np.array(parameters["vertex_normals"]), asset.points.normals.ravel())
-    np.testing.assert_array_equal(np.array(parameters["faces"]), asset.points.patches.triangles().ravel())
+    np.testing.assert_array_equal(
+        np.array(parameters["vertex_positions"]), asset.points.positions.ravel()
+    )
+    np.testing.assert_array_equal(
+        np.array(parameters["vertex_normals"]), asset.points.normals.ravel()
+    )
+    np.testing.assert_array_equal(
+        np.array(parameters["faces"]), asset.points.patches.triangles().ravel()
+    )
 
 
 def test_trimesh_reads_the_ply(asset, radiance, tmp_path):
@@ -81,7 +102,9 @@ def test_trimesh_reads_the_ply(asset, radiance, tmp_path):
     vertex, face = read_ply(path)
     np.testing.assert_allclose(mesh.vertices, asset.points.positions)
     np.testing.assert_array_equal(mesh.faces, face)
-    np.testing.assert_array_equal(mesh.visual.vertex_colors[:, :3], columns(vertex, "red green blue"))
+    np.testing.assert_array_equal(
+        mesh.visual.vertex_colors[:, :3], columns(vertex, "red green blue")
+    )
 
 
 def test_npz_holds_plain_arrays(asset, radiance, tmp_path):
@@ -107,7 +130,9 @@ def test_npz_holds_plain_arrays(asset, radiance, tmp_path):
 
 
 def test_exr_keeps_every_bit(tmp_path):
-    """Single precision is kept, below 0, above 65504 (where half precision ends) and between its steps."""
+    """Single precision is kept, below 0, above 65504 (where half precision ends) and between its
+    steps.
+    """
     image = np.random.default_rng(0).normal(0, 1e5, (7, 11, 3)).astype(np.float32)
     export.write_image(tmp_path / "image.EXR", image, factor=3.0)
     with OpenEXR.File(str(tmp_path / "image.EXR")) as file:
@@ -115,7 +140,9 @@ def test_exr_keeps_every_bit(tmp_path):
 
 
 def test_png_holds_displayed_values(tmp_path):
-    """All 256 values of 8 bits are reached, each rounded to the nearest; the exposure comes first."""
+    """All 256 values of 8 bits are reached, each rounded to the nearest; the exposure comes
+    first.
+    """
     image = np.linspace(-0.1, 1.2, 3 * 4096).reshape(64, 64, 3)
     export.write_image(tmp_path / "image.png", image / 4, factor=4.0)
     pixels = np.asarray(Image.open(tmp_path / "image.png"))
@@ -127,7 +154,9 @@ def test_png_holds_displayed_values(tmp_path):
 
 
 def test_a_failed_write_leaves_the_previous_file(asset, radiance, tmp_path, monkeypatch):
-    """The disk fills up, or the process is stopped, while a file is half written: the old one stays and nothing else."""
+    """The disk fills up, or the process is stopped, while a file is half written: the old one stays
+    and nothing else.
+    """
     path = tmp_path / "points.npz"
     export.write_npz(path, asset, radiance, radiance)
     before = path.read_bytes()
@@ -167,7 +196,9 @@ def test_unusable_paths_are_refused(asset, radiance, tmp_path):
 
 
 def test_files_get_the_usual_permissions(tmp_path):
-    """Temporary files are private; what takes the place of the output is as readable as any new file."""
+    """Temporary files are private; what takes the place of the output is as readable as any new
+    file.
+    """
     (tmp_path / "usual").touch()
     export.write_image(tmp_path / "image.png", np.zeros((2, 2, 3)))
     assert (tmp_path / "image.png").stat().st_mode == (tmp_path / "usual").stat().st_mode

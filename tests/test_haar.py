@@ -1,13 +1,14 @@
-"""Haar wavelets on a cubemap: the transform against its definition, the best coefficients against trying all, fits against
-direct sums."""
+"""Haar wavelets on a cubemap: the transform against its definition, the best coefficients against
+trying all, fits against direct sums.
+"""
 
 from itertools import combinations
 
 import numpy as np
 import pytest
 import scipy.sparse
-
 from conftest import relative_l2, uniform_directions
+
 from mi_prt import SettingsError
 from mi_prt.basis.haar import HaarBasis, SharedHaarBasis, fit_haar, fit_haar_shared, haar_transform
 from mi_prt.basis.rows import Rows
@@ -21,7 +22,9 @@ def shadowed(count, lattice, seed=0):
     """Transport (count, s): clamped cosines behind random half-spaces."""
     rng = np.random.default_rng(seed)
     cosines = np.maximum(uniform_directions(rng, count) @ lattice.vectors.T, 0)
-    return (cosines * (uniform_directions(rng, count) @ lattice.vectors.T > -0.3)).astype(np.float32)
+    return (cosines * (uniform_directions(rng, count) @ lattice.vectors.T > -0.3)).astype(
+        np.float32
+    )
 
 
 def rows_of(matrix, lattice):
@@ -46,18 +49,22 @@ def wavelets(lattice):
     return haar_transform(lattice.resolution).inverse(identity) * np.sqrt(lattice.solid_angles)
 
 
-# --- transform -----------------------------------------------------------------------------------------------------
+# --- transform ------------------------------------------------------------------------------------
 
 
 def merged(a1, a2, w1, w2):
-    """Detail and scale of two weighted values, with the weights of both, as the transform is defined."""
+    """Detail and scale of two weighted values, with the weights of both, as the transform is
+    defined.
+    """
     detail = (np.sqrt(w2) * a1 - np.sqrt(w1) * a2) / np.sqrt(w1 + w2)
     scale = (np.sqrt(w1) * a1 + np.sqrt(w2) * a2) / np.sqrt(w1 + w2)
     return (detail, w1 * w2 / (w1 + w2)), (scale, w1 + w2)
 
 
 def transformed_face(values, weights):
-    """The transform of one face (N, N) by its definition, 2 × 2 cells at a time, each left where the documentation says."""
+    """The transform of one face (N, N) by its definition, 2 × 2 cells at a time, each left where
+    the documentation says.
+    """
     result, n = values * np.sqrt(weights), len(values)
     weights, step = weights.copy(), 1
     while step < n:
@@ -81,7 +88,11 @@ def test_the_transform_is_its_definition(resolution):
     rows = np.random.default_rng(0).random((3, len(lattice))).astype(np.float32)
     shape = (-1, resolution, resolution)
     weights = lattice.solid_angles.reshape(shape)
-    expected = [transformed_face(*both) for row in rows for both in zip(row.astype(float).reshape(shape), weights)]
+    expected = [
+        transformed_face(*both)
+        for row in rows
+        for both in zip(row.astype(float).reshape(shape), weights)
+    ]
     result = haar_transform(resolution).forward(rows.copy())
     assert result.dtype == np.float32
     np.testing.assert_allclose(result, np.reshape(expected, rows.shape), atol=1e-6)
@@ -99,7 +110,9 @@ def test_energy_and_rows_are_kept():
     rows = np.random.default_rng(0).standard_normal((20, len(lattice))).astype(np.float32)
     coefficients = transform.forward(rows.copy())
     energies = np.square(rows, dtype=np.float64) @ lattice.solid_angles
-    np.testing.assert_allclose(np.square(coefficients, dtype=np.float64).sum(axis=1), energies, rtol=1e-6)
+    np.testing.assert_allclose(
+        np.square(coefficients, dtype=np.float64).sum(axis=1), energies, rtol=1e-6
+    )
     assert relative_l2(transform.inverse(coefficients), rows) < 1e-6
 
 
@@ -107,13 +120,19 @@ def test_energy_and_rows_are_kept():
 def test_a_constant_is_six_coefficients(resolution):
     """Differences of equal values are zero exactly; each face's mean weighs 4π/6."""
     lattice = Cubemap(resolution)
-    coefficients = haar_transform(resolution).forward(np.full((1, len(lattice)), 0.7, np.float32)).reshape(6, -1)
+    coefficients = (
+        haar_transform(resolution)
+        .forward(np.full((1, len(lattice)), 0.7, np.float32))
+        .reshape(6, -1)
+    )
     assert not coefficients[:, :-1].any()
     np.testing.assert_allclose(coefficients[:, -1], 0.7 * np.sqrt(4 * np.pi / 6), rtol=1e-6)
 
 
 def test_wavelets_are_local_and_integrate_to_zero():
-    """All but the six means: three on each block of 2 × 2, of 4 × 4, … cells, constant on its quarters."""
+    """All but the six means: three on each block of 2 × 2, of 4 × 4, … cells, constant on its
+    quarters.
+    """
     lattice = Cubemap(8)
     vectors = wavelets(lattice).reshape(6, 64, 6, 8, 8)
     functions = vectors / np.sqrt(lattice.solid_angles).reshape(6, 8, 8)
@@ -128,12 +147,16 @@ def test_wavelets_are_local_and_integrate_to_zero():
             first_row, first_column = rows.min() // side * side, columns.min() // side * side
             block = function[face, first_row : first_row + side, first_column : first_column + side]
             quarters = block.reshape(2, side // 2, 2, side // 2)
-            np.testing.assert_allclose(quarters, quarters[:, :1, :, :1].repeat(side // 2, 1).repeat(side // 2, 3), atol=1e-6)
+            np.testing.assert_allclose(
+                quarters,
+                quarters[:, :1, :, :1].repeat(side // 2, 1).repeat(side // 2, 3),
+                atol=1e-6,
+            )
             sizes.append(side)
     assert [sizes.count(side) for side in (2, 4, 8)] == [6 * 3 * 16, 6 * 3 * 4, 6 * 3]
 
 
-# --- best coefficients of each row -----------------------------------------------------------------------------------
+# --- best coefficients of each row ----------------------------------------------------------------
 
 
 @pytest.mark.parametrize("components", [1, 2, 22])
@@ -149,7 +172,9 @@ def test_no_other_choice_of_wavelets_is_better(components):
 
 
 def test_coefficients_are_a_sparse_matrix_of_k_a_row():
-    """Sorted by column, float32, k entries even where a row has fewer wavelets; the rows are left as they are."""
+    """Sorted by column, float32, k entries even where a row has fewer wavelets; the rows are left
+    as they are.
+    """
     rows = shadowed(30, LATTICE)
     rows[0], rows[1] = 0, 1
     before = rows.copy()
@@ -158,7 +183,9 @@ def test_coefficients_are_a_sparse_matrix_of_k_a_row():
     assert (coefficients.shape, coefficients.dtype) == ((30, len(LATTICE)), np.float32)
     np.testing.assert_array_equal(np.diff(coefficients.indptr), 20)
     assert (np.diff(coefficients.indices.reshape(30, 20)) > 0).all()
-    np.testing.assert_array_equal(np.count_nonzero(coefficients.data.reshape(30, 20), axis=1)[:2], [0, 6])
+    np.testing.assert_array_equal(
+        np.count_nonzero(coefficients.data.reshape(30, 20), axis=1)[:2], [0, 6]
+    )
     np.testing.assert_array_equal(rows, before)
     for other in (rows.astype(np.float64), np.asfortranarray(rows)):
         assert (basis_of(LATTICE, 20).encode(other) != coefficients).nnz == 0
@@ -178,7 +205,9 @@ def test_no_rows():
 
 
 def test_response_is_that_of_the_reconstruction():
-    """The sparse coefficients times the light's are Σ w L T̂, for light of any range; there is no mean."""
+    """The sparse coefficients times the light's are Σ w L T̂, for light of any range; there is no
+    mean.
+    """
     rows, basis = shadowed(40, LATTICE), basis_of(LATTICE, 30)
     light = np.random.default_rng(0).random((len(LATTICE), 3)).astype(np.float32) ** 4
     light[7] = 1e5  # a sun
@@ -204,11 +233,13 @@ def test_single_cells(resolution):
         assert basis.at(coefficients[[3, 8]], cells[[3, 8], :1]).shape == (2, 1)
 
 
-# --- one set for all rows ----------------------------------------------------------------------------------------------
+# --- one set for all rows -------------------------------------------------------------------------
 
 
 def test_the_shared_set_carries_the_most_energy():
-    """Energies of all wavelets by dense products: the set is that of the largest, in order, and encoding projects on it."""
+    """Energies of all wavelets by dense products: the set is that of the largest, in order, and
+    encoding projects on it.
+    """
     rows = shadowed(200, LATTICE)
     basis = fit(fit_haar_shared, rows, components=25).basis
     assert (len(basis), basis.kind, basis.vectors.dtype) == (25, "haar-shared", np.float32)
@@ -223,15 +254,16 @@ def test_the_shared_set_carries_the_most_energy():
     np.testing.assert_array_equal(again.encode(rows), basis.encode(rows))
 
 
-# --- fits ----------------------------------------------------------------------------------------------------------
+# --- fits -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("function", [fit_haar, fit_haar_shared])
 @pytest.mark.parametrize(("components", "common"), [(30, 0), (384, 0), (1, 3)])
 def test_a_fit_tells_its_error(function, components, common):
-    """Captured variance and relative error are those of the residual of the reconstruction, taken directly, and what the
-    components carry adds up to it. One wavelet is worse than the mean where rows have much in common. Rows are more than a
-    block of each of the chunks that are summed."""
+    """Captured variance and relative error are those of the residual of the reconstruction, taken
+    directly, and what the components carry adds up to it. One wavelet is worse than the mean where
+    rows have much in common. Rows are more than a block of each of the chunks that are summed.
+    """
     rows = shadowed(16 * 128 + 500, LATTICE) + np.float32(common) * shadowed(1, LATTICE, seed=1)
     result = fit(function, rows, components=components)
     basis = result.basis
@@ -251,24 +283,35 @@ def test_shares_are_those_of_the_largest_the_second_and_so_on():
     coefficients = rows * np.sqrt(LATTICE.solid_angles) @ wavelets(LATTICE).T
     largest = np.sort(np.square(coefficients), axis=1)[:, :-11:-1].sum(axis=0)
     variance = square_sum(rows - rows.mean(axis=0, dtype=np.float64), LATTICE)
-    np.testing.assert_allclose(fit(fit_haar, rows, components=10).basis.captured_variance, largest / variance, rtol=1e-4)
+    np.testing.assert_allclose(
+        fit(fit_haar, rows, components=10).basis.captured_variance, largest / variance, rtol=1e-4
+    )
 
 
 @pytest.mark.parametrize("function", [fit_haar, fit_haar_shared])
 @pytest.mark.parametrize("share", [0.01, 0.5, 0.9, 0.999])
 def test_a_share_of_the_variance_takes_the_fewest(function, share):
-    """One wavelet less captures less than the share; the fit is the one for that number of components."""
+    """One wavelet less captures less than the share; the fit is the one for that number of
+    components.
+    """
     rows = shadowed(300, LATTICE)
     result = fit(function, rows, variance=share)
     count = len(result.basis)
     same = fit(function, rows, components=count)
-    assert result.captured_variance == pytest.approx(same.captured_variance, abs=1e-6) and result.captured_variance >= share
-    np.testing.assert_allclose(result.basis.captured_variance, same.basis.captured_variance, rtol=1e-6)
+    assert (
+        result.captured_variance == pytest.approx(same.captured_variance, abs=1e-6)
+        and result.captured_variance >= share
+    )
+    np.testing.assert_allclose(
+        result.basis.captured_variance, same.basis.captured_variance, rtol=1e-6
+    )
     assert count == 1 or fit(function, rows, components=count - 1).captured_variance < share
 
 
 def test_each_row_with_its_own_wavelets_is_better():
-    """For the same number of coefficients a row the sparse basis is the best there is, so never worse than a shared set."""
+    """For the same number of coefficients a row the sparse basis is the best there is, so never
+    worse than a shared set.
+    """
     rows = shadowed(300, LATTICE)
     own, shared = (fit(function, rows, components=40) for function in (fit_haar, fit_haar_shared))
     assert own.relative_error < 0.6 * shared.relative_error
@@ -277,11 +320,21 @@ def test_each_row_with_its_own_wavelets_is_better():
 @pytest.mark.parametrize("function", [fit_haar, fit_haar_shared])
 @pytest.mark.parametrize("count", [1, 300])
 def test_where_nothing_varies_all_of_it_is_captured(function, count):
-    """Equal rows have no variance: a constant takes its six wavelets. No transport at all has no error."""
+    """Equal rows have no variance: a constant takes its six wavelets.
+
+    No transport at all has no error.
+    """
     constant = fit(function, np.ones((count, len(LATTICE)), np.float32), variance=0.99)
-    assert (len(constant.basis), constant.captured_variance, constant.relative_error) == (6, 1.0, 0.0)
+    assert (len(constant.basis), constant.captured_variance, constant.relative_error) == (
+        6,
+        1.0,
+        0.0,
+    )
     np.testing.assert_array_equal(constant.basis.captured_variance, 0)
-    assert fit(function, np.ones((count, len(LATTICE)), np.float32), components=5).captured_variance == 0
+    assert (
+        fit(function, np.ones((count, len(LATTICE)), np.float32), components=5).captured_variance
+        == 0
+    )
     dark = fit(function, np.zeros((count, len(LATTICE)), np.float32), variance=0.99)
     assert (len(dark.basis), dark.captured_variance, dark.relative_error) == (1, 1.0, 0.0)
 
@@ -314,5 +367,9 @@ def test_impossible_numbers_are_refused(function, components):
 @pytest.mark.parametrize("function", [fit_haar, fit_haar_shared])
 def test_progress_ends_complete(function):
     calls = []
-    function(rows_of(shadowed(20, LATTICE), LATTICE), Target(4), progress=lambda *done: calls.append(done))
+    function(
+        rows_of(shadowed(20, LATTICE), LATTICE),
+        Target(4),
+        progress=lambda *done: calls.append(done),
+    )
     assert calls[-1][0] == calls[-1][1]

@@ -1,12 +1,14 @@
-"""Spherical harmonics: their values, how they turn, and the basis that they make, against closed forms and least squares."""
+"""Spherical harmonics: their values, how they turn, and the basis that they make, against closed
+forms and least squares.
+"""
 
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 import pytest
-
 from conftest import random_rotation, relative_l2, uniform_directions
+
 from mi_prt import SettingsError
 from mi_prt.basis.harmonics import (
     MAX_BANDS,
@@ -21,15 +23,17 @@ from mi_prt.basis.harmonics import (
 )
 from mi_prt.basis.rows import Rows
 from mi_prt.basis.target import Fit, Target
-from mi_prt.lighting.lattice import LatticeMap
 from mi_prt.directions import Cubemap
+from mi_prt.lighting.lattice import LatticeMap
 
 LATTICE = Cubemap(8)
 
 
 @dataclass(frozen=True, eq=False)
 class Scattered:
-    """Random directions of random solid angles: the functions are far from orthonormal over them."""
+    """Random directions of random solid angles: the functions are far from orthonormal over
+    them.
+    """
 
     count: int
 
@@ -53,7 +57,9 @@ def shadowed(count, lattice, seed=0):
     """Transport (count, s): clamped cosines behind random half-spaces."""
     rng = np.random.default_rng(seed)
     cosines = np.maximum(uniform_directions(rng, count) @ lattice.vectors.T, 0)
-    return (cosines * (uniform_directions(rng, count) @ lattice.vectors.T > -0.3)).astype(np.float32)
+    return (cosines * (uniform_directions(rng, count) @ lattice.vectors.T > -0.3)).astype(
+        np.float32
+    )
 
 
 def rows_of(matrix, lattice):
@@ -68,11 +74,13 @@ def square_sum(matrix, lattice):
     return float((np.square(matrix, dtype=np.float64) @ lattice.solid_angles).sum())
 
 
-# --- values --------------------------------------------------------------------------------------------------------
+# --- values ---------------------------------------------------------------------------------------
 
 
 def test_the_first_four_bands_are_their_polynomials():
-    """The usual real harmonics in x, y, z, written out; the length of a direction does not matter."""
+    """The usual real harmonics in x, y, z, written out; the length of a direction does not
+    matter.
+    """
     vectors = uniform_directions(np.random.default_rng(0), 100)
     x, y, z = vectors.T
     polynomials = [
@@ -98,11 +106,22 @@ def test_the_first_four_bands_are_their_polynomials():
 
 
 def test_addition_theorem():
-    """Σ_m Yₗₘ(a) Yₗₘ(b) = (2l + 1)/4π Pₗ(a·b) in every band; poles, equal and opposite directions are among the pairs."""
+    """Σ_m Yₗₘ(a) Yₗₘ(b) = (2l + 1)/4π Pₗ(a·b) in every band; poles, equal and opposite directions
+    are among the pairs.
+    """
     first = uniform_directions(np.random.default_rng(0), 200)
     second = uniform_directions(np.random.default_rng(1), 200)
     first[:4] = [[0, 0, 1], [0, 0, -1], [0, 0, 1], [1e-9, 0, -1]]
-    second[:8] = [[0, 0, 1], [0, 0, 1], first[2], first[3], first[4], first[5], -first[6], -first[7]]
+    second[:8] = [
+        [0, 0, 1],
+        [0, 0, 1],
+        first[2],
+        first[3],
+        first[4],
+        first[5],
+        -first[6],
+        -first[7],
+    ]
     products = evaluate(first, MAX_BANDS) * evaluate(second, MAX_BANDS)
     cosines = (first * second).sum(axis=1)
     for band in range(MAX_BANDS):
@@ -112,25 +131,34 @@ def test_addition_theorem():
 
 
 def test_orthonormal_over_the_sphere():
-    """Gauss-Legendre in cos θ times equal steps in φ integrates products of these polynomials exactly."""
+    """Gauss-Legendre in cos θ times equal steps in φ integrates products of these polynomials
+    exactly.
+    """
     nodes, weights = np.polynomial.legendre.leggauss(MAX_BANDS)
     azimuths = 2 * np.pi * np.arange(2 * MAX_BANDS) / (2 * MAX_BANDS)
     z, azimuth = (grid.ravel() for grid in np.meshgrid(nodes, azimuths, indexing="ij"))
     sine = np.sqrt(1 - z * z)
-    values = evaluate(np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), z], axis=1), MAX_BANDS)
+    values = evaluate(
+        np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), z], axis=1), MAX_BANDS
+    )
     gram = values * np.repeat(weights, len(azimuths)) * (2 * np.pi / len(azimuths)) @ values.T
     np.testing.assert_allclose(gram, np.eye(MAX_BANDS**2), atol=1e-12)
 
 
 def test_at_the_poles_only_zonal_functions_are_left():
-    """Yₗ₀ is √((2l + 1)/4π) at +z and (−1)ˡ of it at −z; all others vanish. Signed zeros and tiny numbers too."""
+    """Yₗ₀ is √((2l + 1)/4π) at +z and (−1)ˡ of it at −z; all others vanish.
+
+    Signed zeros and tiny numbers too.
+    """
     up = [[0.0, 0, 1], [-0.0, 0, 3], [1e-200, 0, 1]]
     down = [[0.0, -0.0, -1], [0, 1e-200, -2]]
     values = evaluate(np.array(up + down), MAX_BANDS)
     expected = np.zeros((MAX_BANDS**2, 5))
     bands = np.arange(MAX_BANDS)
     expected[bands * bands + bands, :3] = np.sqrt((2 * bands + 1) / (4 * np.pi))[:, None]
-    expected[bands * bands + bands, 3:] = (np.sqrt((2 * bands + 1) / (4 * np.pi)) * (-1.0) ** bands)[:, None]
+    expected[bands * bands + bands, 3:] = (
+        np.sqrt((2 * bands + 1) / (4 * np.pi)) * (-1.0) ** bands
+    )[:, None]
     np.testing.assert_allclose(values, expected, atol=1e-13)
 
 
@@ -138,7 +166,7 @@ def test_no_directions():
     assert evaluate(np.zeros((0, 3)), 5).shape == (25, 0)
 
 
-# --- rotation ------------------------------------------------------------------------------------------------------
+# --- rotation -------------------------------------------------------------------------------------
 
 
 def turn(axis, degrees):
@@ -174,11 +202,15 @@ MATRICES = {
 @pytest.mark.parametrize("bands", [1, 2, 3, 11, 21, MAX_BANDS])
 @pytest.mark.parametrize("name", MATRICES)
 def test_blocks_turn_the_functions(name, bands):
-    """Y(R ω) = D Y(ω) to 1e-10, by functions that come from Legendre's recurrence, not from rotations; D is orthogonal."""
+    """Y(R ω) = D Y(ω) to 1e-10, by functions that come from Legendre's recurrence, not from
+    rotations; D is orthogonal.
+    """
     matrix = MATRICES[name]
     vectors = uniform_directions(np.random.default_rng(5), 50)
     blocks = rotation(matrix, bands)
-    assert [block.shape for block in blocks] == [(2 * band + 1, 2 * band + 1) for band in range(bands)]
+    assert [block.shape for block in blocks] == [
+        (2 * band + 1, 2 * band + 1) for band in range(bands)
+    ]
     turned, values = evaluate(vectors @ matrix.T, bands), evaluate(vectors, bands)
     for band, block in enumerate(blocks):
         functions = slice(band**2, (band + 1) ** 2)
@@ -192,7 +224,9 @@ def test_the_identity_changes_nothing_at_all():
 
 
 def test_a_turn_about_z_mixes_only_opposite_orders():
-    """cos m(φ + α) = cos mα cos mφ − sin mα sin mφ, sin m(φ + α) = sin mα cos mφ + cos mα sin mφ."""
+    """cos m(φ + α) = cos mα cos mφ − sin mα sin mφ, sin m(φ + α) = sin mα cos mφ + cos mα sin
+    mφ.
+    """
     alpha = np.radians(33)
     for band, block in enumerate(rotation(turn("z", 33), 21)):
         expected = np.zeros_like(block)
@@ -202,8 +236,15 @@ def test_a_turn_about_z_mixes_only_opposite_orders():
         np.testing.assert_allclose(block, expected, atol=1e-12)
 
 
-@pytest.mark.parametrize(("a", "b"), [("random", "another"), ("gimbal up", "half turn x"), ("mirror", "random"),
-                                      ("mirrored random", "inversion")])  # fmt: skip
+@pytest.mark.parametrize(
+    ("a", "b"),
+    [
+        ("random", "another"),
+        ("gimbal up", "half turn x"),
+        ("mirror", "random"),
+        ("mirrored random", "inversion"),
+    ],
+)
 def test_blocks_compose(a, b):
     """D(AB) = D(A) D(B), reflections included."""
     a, b = MATRICES[a], MATRICES[b]
@@ -223,7 +264,14 @@ def test_rotate_turns_light(name):
 
 
 @pytest.mark.parametrize(
-    "matrix", [2 * np.eye(3), np.eye(4), np.zeros((3, 3)), np.full((3, 3), np.nan), [[1, 1, 0], [0, 1, 0], [0, 0, 1]]]
+    "matrix",
+    [
+        2 * np.eye(3),
+        np.eye(4),
+        np.zeros((3, 3)),
+        np.full((3, 3), np.nan),
+        [[1, 1, 0], [0, 1, 0], [0, 0, 1]],
+    ],
 )
 def test_what_is_no_rotation_is_refused(matrix):
     with pytest.raises(SettingsError, match="without scale or shear"):
@@ -235,13 +283,15 @@ def test_coefficients_of_a_part_of_a_band_are_refused():
         rotate(np.zeros((10, 3)), np.eye(3))
 
 
-# --- basis ---------------------------------------------------------------------------------------------------------
+# --- basis ----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("lattice", [LATTICE, Scattered(300)], ids=str)
 @pytest.mark.parametrize("bands", [1, 3, 6])
 def test_encoding_is_least_squares(lattice, bands):
-    """The coefficients are those of NumPy's lstsq in the √w-weighted space, and the reconstruction its fitted rows."""
+    """The coefficients are those of NumPy's lstsq in the √w-weighted space, and the reconstruction
+    its fitted rows.
+    """
     matrix = shadowed(60, lattice)
     basis = fit(matrix, lattice, components=bands**2).basis
     assert (len(basis), basis.bands, basis.kind) == (bands**2, bands, "sh")
@@ -260,9 +310,11 @@ def test_encoding_is_least_squares(lattice, bands):
 @pytest.mark.parametrize("lattice", [LATTICE, Scattered(300)], ids=str)
 @pytest.mark.parametrize(("bands", "common"), [(1, 0), (4, 0), (1, 3)])
 def test_a_fit_tells_its_error(lattice, bands, common):
-    """Captured variance and relative error are those of the residual of the reconstruction, taken directly; energies of the
-    functions add up to what is captured. A constant is worse than the mean where rows have much in common. Rows are more
-    than a block of each of the chunks that are summed."""
+    """Captured variance and relative error are those of the residual of the reconstruction, taken
+    directly; energies of the functions add up to what is captured. A constant is worse than the
+    mean where rows have much in common. Rows are more than a block of each of the chunks that are
+    summed.
+    """
     matrix = shadowed(16 * 128 + 500, lattice) + np.float32(common) * shadowed(1, lattice, seed=1)
     result = fit(matrix, lattice, components=bands**2)
     residual = square_sum(result.basis.reconstruct(result.basis.encode(matrix)) - matrix, lattice)
@@ -272,20 +324,31 @@ def test_a_fit_tells_its_error(lattice, bands, common):
     assert (result.captured_variance < 0) == (common > 0)
     assert result.relative_error == pytest.approx(np.sqrt(residual / energy), abs=1e-4)
     assert result.basis.captured_variance.shape == (bands**2,)
-    assert result.basis.captured_variance.sum() * variance == pytest.approx(energy - residual, rel=1e-5)
+    assert result.basis.captured_variance.sum() * variance == pytest.approx(
+        energy - residual, rel=1e-5
+    )
 
 
 def test_functions_in_the_span_are_kept():
-    """Rows made of 25 functions are reproduced by them; a fit of sums of squares tells errors down to about 1e-4."""
+    """Rows made of 25 functions are reproduced by them; a fit of sums of squares tells errors down
+    to about 1e-4.
+    """
     matrix = np.random.default_rng(0).standard_normal((200, 25)) @ evaluate(LATTICE.vectors, 5)
     result = fit(matrix.astype(np.float32), components=25)
-    assert relative_l2(result.basis.reconstruct(result.basis.encode(matrix.astype(np.float32))), matrix) < 1e-6
+    assert (
+        relative_l2(
+            result.basis.reconstruct(result.basis.encode(matrix.astype(np.float32))), matrix
+        )
+        < 1e-6
+    )
     assert result.relative_error < 1e-3 and result.captured_variance > 1 - 1e-5
 
 
 def test_response_is_that_of_the_reconstruction():
-    """c·ℓ = Σ w L T̂ for any light, though the functions are not orthonormal over the lattice. Under light that the functions
-    hold, here 1 + z, it is the response of T itself: what is left out of T is orthogonal to them."""
+    """c·ℓ = Σ w L T̂ for any light, though the functions are not orthonormal over the lattice.
+    Under light that the functions hold, here 1 + z, it is the response of T itself: what is left
+    out of T is orthogonal to them.
+    """
     lattice = Scattered(300)
     matrix = shadowed(50, lattice)
     basis = fit(matrix, lattice, components=9).basis
@@ -294,19 +357,28 @@ def test_response_is_that_of_the_reconstruction():
     light = np.random.default_rng(0).random((300, 3)).astype(np.float32) ** 4
     projected, mean_response = basis.project_light(light)
     np.testing.assert_array_equal(mean_response, 0)
-    assert relative_l2(coefficients @ projected, basis.reconstruct(coefficients) @ (weights * light)) < 1e-5
+    assert (
+        relative_l2(coefficients @ projected, basis.reconstruct(coefficients) @ (weights * light))
+        < 1e-5
+    )
     smooth = np.repeat(1 + lattice.vectors[:, 2:], 3, axis=1).astype(np.float32)
-    assert relative_l2(coefficients @ basis.project_light(smooth)[0], matrix @ (weights * smooth)) < 1e-5
+    assert (
+        relative_l2(coefficients @ basis.project_light(smooth)[0], matrix @ (weights * smooth))
+        < 1e-5
+    )
 
 
 def test_clamped_cosines():
-    """max(0, n·ω) = Σ Aₗ Yₗₘ(n) Yₗₘ(ω) with A = π, 2π/3, π/4, 0, −π/24, 0, π/64 (Ramamoorthi and Hanrahan 2001); a lattice
-    of 32² cells a face gives them to some 1e-3."""
+    """max(0, n·ω) = Σ Aₗ Yₗₘ(n) Yₗₘ(ω) with A = π, 2π/3, π/4, 0, −π/24, 0, π/64 (Ramamoorthi and
+    Hanrahan 2001); a lattice of 32² cells a face gives them to some 1e-3.
+    """
     lattice = Cubemap(32)
     normals = uniform_directions(np.random.default_rng(0), 20)
     matrix = np.maximum(normals @ lattice.vectors.T, 0).astype(np.float32)
     coefficients = fit(matrix, lattice, components=49).basis.encode(matrix)
-    factors = np.repeat([np.pi, 2 * np.pi / 3, np.pi / 4, 0, -np.pi / 24, 0, np.pi / 64], 2 * np.arange(7) + 1)
+    factors = np.repeat(
+        [np.pi, 2 * np.pi / 3, np.pi / 4, 0, -np.pi / 24, 0, np.pi / 64], 2 * np.arange(7) + 1
+    )
     np.testing.assert_allclose(coefficients, factors * evaluate(normals, 7).T, atol=2e-3)
 
 
@@ -317,9 +389,13 @@ def test_a_basis_made_of_its_arrays_is_the_same():
     np.testing.assert_array_equal(again.encode(matrix), basis.encode(matrix))
 
 
-@pytest.mark.parametrize("matrix", [turn("z", 90), turn("x", 180), turn("y", -90), np.diag([1.0, -1, 1])])
+@pytest.mark.parametrize(
+    "matrix", [turn("z", 90), turn("x", 180), turn("y", -90), np.diag([1.0, -1, 1])]
+)
 def test_light_turned_in_the_basis_is_light_turned_in_the_cells(matrix):
-    """Turns that take a cubemap to itself only permute its cells: equal for any light, to rounding."""
+    """Turns that take a cubemap to itself only permute its cells: equal for any light, to
+    rounding.
+    """
     basis = fit(shadowed(20, LATTICE), components=100).basis
     light = np.random.default_rng(0).random((len(LATTICE), 3)).astype(np.float32) ** 4
     turned = light[LATTICE.cells(LATTICE.vectors @ matrix)]  # L'(ω) = L(R⁻¹ω)
@@ -331,26 +407,38 @@ def test_light_turned_in_the_basis_is_light_turned_in_the_cells(matrix):
 
 
 def test_turns_of_light_add_up():
-    """The later turn is about the world's axes: turned about x, then about y. What is not turned is as it was."""
+    """The later turn is about the world's axes: turned about x, then about y.
+
+    What is not turned is as it was.
+    """
     coefficients = np.random.default_rng(0).standard_normal((49, 3)).astype(np.float32)
     environment = LatticeMap(Cubemap(1), np.ones((6, 3), np.float32), np.eye(3))
     light = HarmonicMap(environment, ("cubemap:8", 49), coefficients)
     np.testing.assert_allclose(light.turned(), coefficients, atol=1e-6)
     turned = light.rotated("x", 20).rotated("y", 75)
     assert relative_l2(turned.turned(), rotate(coefficients, turn("y", 75) @ turn("x", 20))) < 1e-6
-    np.testing.assert_allclose(turned.environment.rotation, turn("y", 75) @ turn("x", 20), atol=1e-12)
+    np.testing.assert_allclose(
+        turned.environment.rotation, turn("y", 75) @ turn("x", 20), atol=1e-12
+    )
 
 
-# --- targets -------------------------------------------------------------------------------------------------------
+# --- targets --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("share", [0.5, 0.9, 0.985])  # the last takes more than FIRST_BANDS
 def test_a_share_of_the_variance_takes_the_fewest_bands(share):
-    """One band less captures less than the share; the fit is the one for that number of components."""
+    """One band less captures less than the share; the fit is the one for that number of
+    components.
+    """
     matrix = shadowed(300, LATTICE)
     result = fit(matrix, variance=share)
     bands = result.basis.bands
-    assert bands > 1 and result.captured_variance >= share > fit(matrix, components=(bands - 1) ** 2).captured_variance
+    assert (
+        bands > 1
+        and result.captured_variance
+        >= share
+        > fit(matrix, components=(bands - 1) ** 2).captured_variance
+    )
     same = fit(matrix, components=bands**2)
     assert result.captured_variance == pytest.approx(same.captured_variance, abs=1e-6)
     np.testing.assert_array_equal(result.basis.vectors, same.basis.vectors)
@@ -370,8 +458,10 @@ def test_a_share_out_of_reach_is_refused_with_what_can_be_had():
     assert most == pytest.approx(fit(matrix, components=256).captured_variance, abs=1e-5)
 
 
-@pytest.mark.parametrize(("components", "squares"), [(10, "9 or 16"), (0, "use 1$"), (2, "1 or 4"), (1090, "use 1,089$"),
-                                                     (10**9, "use 1,089$")])  # fmt: skip
+@pytest.mark.parametrize(
+    ("components", "squares"),
+    [(10, "9 or 16"), (0, "use 1$"), (2, "1 or 4"), (1090, "use 1,089$"), (10**9, "use 1,089$")],
+)
 def test_components_that_are_no_square_are_refused(components, squares):
     with pytest.raises(SettingsError, match=squares):
         fit(shadowed(5, LATTICE), components=components)
@@ -379,18 +469,30 @@ def test_components_that_are_no_square_are_refused(components, squares):
 
 @pytest.mark.parametrize("resolution", [1, 2, 5, 16])
 def test_a_cubemap_allows_twice_its_resolution_in_bands(resolution):
-    """A great circle through the faces has 4N cells: it tells waves of up to 2N apart. One band more is refused."""
+    """A great circle through the faces has 4N cells: it tells waves of up to 2N apart.
+
+    One band more is refused.
+    """
     lattice = Cubemap(resolution)
     bands = 2 * resolution
     assert len(fit(shadowed(5, lattice), lattice, components=bands**2).basis) == bands**2
-    assert most_harmonics(lattice, (bands + 1) ** 2) == most_harmonics(lattice, bands**2) == bands**2
-    for refused in (check_harmonics, lambda _, components: fit(shadowed(5, lattice), lattice, components=components)):
-        with pytest.raises(SettingsError, match=f"{lattice} tells apart: use at most {bands**2:,} "):
+    assert (
+        most_harmonics(lattice, (bands + 1) ** 2) == most_harmonics(lattice, bands**2) == bands**2
+    )
+    for refused in (
+        check_harmonics,
+        lambda _, components: fit(shadowed(5, lattice), lattice, components=components),
+    ):
+        with pytest.raises(
+            SettingsError, match=f"{lattice} tells apart: use at most {bands**2:,} "
+        ):
             refused(lattice, (bands + 1) ** 2)
 
 
 def test_functions_stay_apart_on_what_is_accepted():
-    """Whatever the lattice, coefficients are at most twice as long as the functions that they make: eigenvalues ≥ ¼."""
+    """Whatever the lattice, coefficients are at most twice as long as the functions that they make:
+    eigenvalues ≥ ¼.
+    """
     lattice = Scattered(300)
     with pytest.raises(SettingsError, match=r"\((\d+) bands\)") as refusal:
         fit(shadowed(5, lattice), lattice, components=MAX_BANDS**2)
@@ -405,31 +507,56 @@ def test_functions_stay_apart_on_what_is_accepted():
 
 @pytest.mark.parametrize("rows", [1, 300])
 def test_where_nothing_varies_all_of_it_is_captured(rows):
-    """Equal rows have no variance; captured is 1 if they are reproduced. No transport at all has no error."""
+    """Equal rows have no variance; captured is 1 if they are reproduced.
+
+    No transport at all has no error.
+    """
     constant = fit(np.ones((rows, len(LATTICE)), np.float32), variance=0.99)
     assert (len(constant.basis), constant.captured_variance) == (1, 1.0)
     assert constant.relative_error < 1e-3
     np.testing.assert_array_equal(constant.basis.captured_variance, 0)
     equal = shadowed(1, LATTICE).repeat(rows, axis=0)
     assert fit(equal, components=4).captured_variance == 0
-    nine = (np.arange(1, 10) @ evaluate(LATTICE.vectors, 3))[None].astype(np.float32).repeat(rows, axis=0)
-    assert (len(fit(nine, variance=0.99).basis), fit(nine, variance=0.99).captured_variance) == (9, 1.0)
+    nine = (
+        (np.arange(1, 10) @ evaluate(LATTICE.vectors, 3))[None]
+        .astype(np.float32)
+        .repeat(rows, axis=0)
+    )
+    assert (len(fit(nine, variance=0.99).basis), fit(nine, variance=0.99).captured_variance) == (
+        9,
+        1.0,
+    )
     dark = fit(np.zeros((rows, len(LATTICE)), np.float32), variance=0.99)
     assert (len(dark.basis), dark.captured_variance, dark.relative_error) == (1, 1.0, 0.0)
 
 
 def test_progress_ends_complete():
     calls = []
-    fit_harmonics(rows_of(shadowed(20, LATTICE), LATTICE), Target(4), progress=lambda *done: calls.append(done))
+    fit_harmonics(
+        rows_of(shadowed(20, LATTICE), LATTICE),
+        Target(4),
+        progress=lambda *done: calls.append(done),
+    )
     assert calls[-1][0] == calls[-1][1]
 
 
 @pytest.mark.parametrize(
     "target",
-    [{}, {"components": 4, "variance": 0.9}, {"components": -1}, {"components": 2.5}, {"components": True},
-     {"components": "4"}, {"variance": 0}, {"variance": 1}, {"variance": -0.5}, {"variance": 95}, {"variance": np.nan},
-     {"variance": "0.9"}],
-)  # fmt: skip
+    [
+        {},
+        {"components": 4, "variance": 0.9},
+        {"components": -1},
+        {"components": 2.5},
+        {"components": True},
+        {"components": "4"},
+        {"variance": 0},
+        {"variance": 1},
+        {"variance": -0.5},
+        {"variance": 95},
+        {"variance": np.nan},
+        {"variance": "0.9"},
+    ],
+)
 def test_impossible_targets_are_refused(target):
     with pytest.raises(SettingsError):
         Target(**target)

@@ -1,4 +1,6 @@
-"""Assets of local lights as files, in settings, and when runs are interrupted: what is read is what was written, or a typed error."""
+"""Assets of local lights as files, in settings, and when runs are interrupted: what is read is what
+was written, or a typed error.
+"""
 
 import json
 import os
@@ -14,14 +16,21 @@ import pytest
 from conftest import cube, diffuse, rectangle, scene, uniform_sky
 
 import mi_prt
-from mi_prt import AssetError, DirectionalLight, LightError, MeshlessAsset, PointLight, SettingsError
-from mi_prt.lighting.local_emitters import local_scene_light
+from mi_prt import (
+    AssetError,
+    DirectionalLight,
+    LightError,
+    MeshlessAsset,
+    PointLight,
+    SettingsError,
+)
 from mi_prt.asset.meshless_file import as_stored, compressed
-from mi_prt.points.points import POINT_FIELDS
 from mi_prt.asset.quantize import LARGEST, cluster_scales, quantized, quantized_by_cluster
-from mi_prt.system.runtime import mitsuba
-from mi_prt.scene.scene import open_scene
+from mi_prt.lighting.local_emitters import local_scene_light
+from mi_prt.points.points import POINT_FIELDS
 from mi_prt.precompute.settings import MeshlessSettings
+from mi_prt.scene.scene import open_scene
+from mi_prt.system.runtime import mitsuba
 
 mi = mitsuba()
 
@@ -33,21 +42,33 @@ SCENE = scene(
     green=rectangle((-1, 0, 0), (1, 0, 0), bsdf=diffuse([0.1, 0.7, 0.1])),
     block=cube((-0.3, -0.7, -0.2), 0.3, bsdf=diffuse(0.6)),
     lamp=rectangle((0, -1, 0), (-0.5, 0.95, 0), 0.15, bsdf=diffuse(0.0), emitter=LAMP),
-    bulb={"type": "point", "position": [0.4, 0.3, 0.2], "intensity": {"type": "rgb", "value": [0.5, 1.0, 2.0]}},
+    bulb={
+        "type": "point",
+        "position": [0.4, 0.3, 0.2],
+        "intensity": {"type": "rgb", "value": [0.5, 1.0, 2.0]},
+    },
 )
-SETTINGS = dict(count=600, cluster_size=60, depth_directions=144, depth_coefficients=8, example_lights=60, transfer_coefficients=6)
+SETTINGS = dict(
+    count=600,
+    cluster_size=60,
+    depth_directions=144,
+    depth_coefficients=8,
+    example_lights=60,
+    transfer_coefficients=6,
+)
 STORAGE = {  # quantization, and a budget of which the transfer matrix is dense or sparse
     "16 dense": dict(quantize="16", transfer_error=0.0),
     "16 sparse": dict(quantize="16", transfer_error=0.15),
     "float32 dense": dict(quantize="none", transfer_error=0.0),
     "float32 sparse": dict(quantize="none", transfer_error=0.15),
 }
-ROUNDED = 1.01  # times half a scale: float32 adds 2⁻²⁴ of up to 32767 scales, in the quotient and in the product
+# times half a scale: float32 adds 2⁻²⁴ of up to 32767 scales, in the quotient and in the product
+ROUNDED = 1.01
 LIGHT = PointLight((0.3, 0.2, 0.4), (1.0, 2.0, 3.0))
 
 
 def precompute(parts=SCENE, **settings):
-    return mi_prt.precompute.precompute(parts, points="samples", **(SETTINGS | settings))
+    return mi_prt.precompute(parts, points="samples", **(SETTINGS | settings))
 
 
 @pytest.fixture(scope="module")
@@ -68,30 +89,47 @@ def files(assets, tmp_path_factory):
 def arrays_of(asset):
     """All arrays of an asset, by name."""
     parts = {f"points/{name}": getattr(asset.points, name) for name in POINT_FIELDS}
-    parts |= {"starts": asset.samples.starts, "roots": asset.samples.roots, "extent": np.array(asset.depth.extent)}
-    parts |= {f"depth/{name}": getattr(asset.depth, name) for name in ("means", "vectors", "coefficients")}
-    parts |= {f"lights/{name}": getattr(asset.own_light, name) for name in ("positions", "axes", "intensity", "cosine", "cutoff", "beam")}
+    parts |= {
+        "starts": asset.samples.starts,
+        "roots": asset.samples.roots,
+        "extent": np.array(asset.depth.extent),
+    }
+    parts |= {
+        f"depth/{name}": getattr(asset.depth, name) for name in ("means", "vectors", "coefficients")
+    }
+    parts |= {
+        f"lights/{name}": getattr(asset.own_light, name)
+        for name in ("positions", "axes", "intensity", "cosine", "cutoff", "beam")
+    }
     if asset.transfer is not None:
-        parts |= {f"transfer/{name}": getattr(asset.transfer, name) for name in ("encoder", "receivers", "matrix")}
+        parts |= {
+            f"transfer/{name}": getattr(asset.transfer, name)
+            for name in ("encoder", "receivers", "matrix")
+        }
     return parts
 
 
 def names_in(path):
     with h5py.File(path) as file:
         names = []
-        file.visit(lambda name: names.append(name) if isinstance(file[name], h5py.Dataset) else None)
+        file.visit(
+            lambda name: names.append(name) if isinstance(file[name], h5py.Dataset) else None
+        )
         return names
 
 
-# --- round trips ---------------------------------------------------------------------------------------------------
+# --- round trips ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("storage", STORAGE)
 def test_round_trip(assets, files, storage):
-    """Bit for bit, every array, text and irradiance: 16-bit numbers are taken when the asset is made, not when it is saved, and both ways to
-    store the transfer matrix occur."""
+    """Bit for bit, every array, text and irradiance: 16-bit numbers are taken when the asset is
+    made, not when it is saved, and both ways to store the transfer matrix occur.
+    """
     asset, loaded = assets[storage], mi_prt.load(files[storage])
-    assert isinstance(loaded, MeshlessAsset) and loaded.path == asset.path == files[storage].absolute()
+    assert (
+        isinstance(loaded, MeshlessAsset) and loaded.path == asset.path == files[storage].absolute()
+    )
     assert ("transfer/columns" in names_in(files[storage])) == ("sparse" in storage)
     before, after = arrays_of(asset), arrays_of(loaded)
     assert before.keys() == after.keys()
@@ -100,11 +138,18 @@ def test_round_trip(assets, files, storage):
         np.testing.assert_array_equal(array, after[name], err_msg=name)
     for name in ("scene", "settings", "versions", "report"):
         assert json.loads(json.dumps(getattr(asset, name))) == getattr(loaded, name), name
-    assert loaded.points.report == asset.points.report and loaded.samples.radius == asset.samples.radius
+    assert (
+        loaded.points.report == asset.points.report
+        and loaded.samples.radius == asset.samples.radius
+    )
     assert list(loaded.points.surfaces) == json.loads(json.dumps(asset.points.surfaces))
     for component in ("direct", "indirect", "total"):
-        np.testing.assert_array_equal(loaded.irradiance(LIGHT, component), asset.irradiance(LIGHT, component))
-        np.testing.assert_array_equal(loaded.irradiance(None, component), asset.irradiance(None, component))
+        np.testing.assert_array_equal(
+            loaded.irradiance(LIGHT, component), asset.irradiance(LIGHT, component)
+        )
+        np.testing.assert_array_equal(
+            loaded.irradiance(None, component), asset.irradiance(None, component)
+        )
     assert asset.irradiance(LIGHT, "indirect").any() and not loaded.buried.any()
 
 
@@ -116,12 +161,23 @@ def test_saving_again_gives_the_same_file(files, tmp_path, storage):
 
 
 def test_round_trip_without_transfer_or_lights(tmp_path):
-    """A run for direct light alone, of a scene whose only emitter is distant: no transfer and no own light, before and after."""
-    parts = scene(floor=rectangle(bsdf=diffuse(0.5)), wall=rectangle((1, 0, 0), (-1, 1, 0), bsdf=diffuse(0.5)), sky={"type": "constant"})
+    """A run for direct light alone, of a scene whose only emitter is distant: no transfer and no
+    own light, before and after.
+    """
+    parts = scene(
+        floor=rectangle(bsdf=diffuse(0.5)),
+        wall=rectangle((1, 0, 0), (-1, 1, 0), bsdf=diffuse(0.5)),
+        sky={"type": "constant"},
+    )
     asset = precompute(parts, bounces=0)
     asset.save(tmp_path / "a.prt")
     loaded = mi_prt.load(tmp_path / "a.prt")
-    assert asset.transfer is None and loaded.transfer is None and not len(loaded.own_light) and loaded.reference_bounces == 0
+    assert (
+        asset.transfer is None
+        and loaded.transfer is None
+        and not len(loaded.own_light)
+        and loaded.reference_bounces == 0
+    )
     assert not any(name.startswith("transfer") for name in names_in(tmp_path / "a.prt"))
     np.testing.assert_array_equal(loaded.irradiance(LIGHT), asset.irradiance(LIGHT))
     for component in ("total", "indirect"):
@@ -129,39 +185,65 @@ def test_round_trip_without_transfer_or_lights(tmp_path):
             loaded.irradiance(component=component)
 
 
-# --- quantization --------------------------------------------------------------------------------------------------
+# --- quantization ---------------------------------------------------------------------------------
 
 
 def test_quantized_numbers_are_within_half_a_scale():
-    """Integers of 16 bits, scales of the largest along an axis over 32767: that one is exact, zeros stay zeros, and none is off by more than half."""
+    """Integers of 16 bits, scales of the largest along an axis over 32767: that one is exact, zeros
+    stay zeros, and none is off by more than half.
+    """
     random = np.random.default_rng(0)
-    values = (random.standard_normal((5, 200, 3)) * 10.0 ** random.integers(-20, 20, (5, 1, 3))).astype(np.float32)
+    values = (
+        random.standard_normal((5, 200, 3)) * 10.0 ** random.integers(-20, 20, (5, 1, 3))
+    ).astype(np.float32)
     values[2, :, 1] = 0
     values[:, 7] = 0
     result = quantized(values, 1)
-    assert result.integers.dtype == np.int16 and result.scale.shape == (5, 1, 3) and result.values.dtype == np.float32
-    assert (np.abs(result.values.astype(float) - values) <= result.scale.astype(float) / 2 * ROUNDED).all()
+    assert (
+        result.integers.dtype == np.int16
+        and result.scale.shape == (5, 1, 3)
+        and result.values.dtype == np.float32
+    )
+    assert (
+        np.abs(result.values.astype(float) - values) <= result.scale.astype(float) / 2 * ROUNDED
+    ).all()
     assert np.abs(result.values - values).max() <= result.bound * ROUNDED
-    assert np.abs(result.integers).max() == LARGEST and not result.values[:, 7].any() and not result.values[2, :, 1].any()
-    np.testing.assert_allclose(np.abs(result.values).max(axis=1), np.abs(values).max(axis=1), rtol=1e-6)
+    assert (
+        np.abs(result.integers).max() == LARGEST
+        and not result.values[:, 7].any()
+        and not result.values[2, :, 1].any()
+    )
+    np.testing.assert_allclose(
+        np.abs(result.values).max(axis=1), np.abs(values).max(axis=1), rtol=1e-6
+    )
 
 
 def test_quantized_by_cluster_has_a_scale_for_each_column_of_each():
     """Large numbers of one cluster cost those of another nothing."""
     random, starts = np.random.default_rng(0), np.array([0, 1, 4, 10])
-    values = (random.standard_normal((10, 4)) * np.repeat([1e6, 1, 1e-6], np.diff(starts))[:, None]).astype(np.float32)
+    values = (
+        random.standard_normal((10, 4)) * np.repeat([1e6, 1, 1e-6], np.diff(starts))[:, None]
+    ).astype(np.float32)
     result = quantized_by_cluster(values, starts)
     scales = cluster_scales(result, starts)
     assert scales.shape == (3, 4)
     for number, (first, last) in enumerate(zip(starts, starts[1:])):
-        np.testing.assert_allclose(scales[number], np.abs(values[first:last]).max(axis=0) / LARGEST, rtol=1e-6)
-        assert (np.abs(result.values[first:last] - values[first:last]) <= scales[number] / 2 * ROUNDED).all()
-    np.testing.assert_array_equal(quantized_by_cluster(np.zeros((10, 4), np.float32), starts).values, np.zeros((10, 4)))
+        np.testing.assert_allclose(
+            scales[number], np.abs(values[first:last]).max(axis=0) / LARGEST, rtol=1e-6
+        )
+        assert (
+            np.abs(result.values[first:last] - values[first:last]) <= scales[number] / 2 * ROUNDED
+        ).all()
+    np.testing.assert_array_equal(
+        quantized_by_cluster(np.zeros((10, 4), np.float32), starts).values, np.zeros((10, 4))
+    )
 
 
 @pytest.mark.parametrize("budget", ["dense", "sparse"])
 def test_what_quantization_changes(assets, budget):
-    """The two runs differ by it alone: each array within half its scale; and the report tells what it makes of depth and indirect irradiance."""
+    """The two runs differ by it alone: each array within half its scale; and the report tells what
+    it makes of depth and indirect irradiance.
+    """
     exact, stored = assets[f"float32 {budget}"], assets[f"16 {budget}"]
     starts = exact.samples.starts
     np.testing.assert_array_equal(exact.points.positions, stored.points.positions)
@@ -178,10 +260,13 @@ def test_what_quantization_changes(assets, budget):
         difference = np.abs(before[name] - after[name])
         assert (difference <= scale / 2 * ROUNDED).all() and difference.any(), name
     worst = max(
-        np.abs(np.log(exact.depth.depth(c, i)) - np.log(stored.depth.depth(c, i))).max() for i, c in enumerate(exact.samples.clusters)
+        np.abs(np.log(exact.depth.depth(c, i)) - np.log(stored.depth.depth(c, i))).max()
+        for i, c in enumerate(exact.samples.clusters)
     )
     assert abs(stored.report["quantization"]["depth"] - worst) < 0.01 * worst < 1e-3
-    assert 0 < stored.report["quantization"]["indirect"] < 1e-3 and exact.report["quantization"] == {"depth": 0.0, "indirect": 0.0}
+    assert 0 < stored.report["quantization"]["indirect"] < 1e-3 and exact.report[
+        "quantization"
+    ] == {"depth": 0.0, "indirect": 0.0}
     one, other = (asset.irradiance(LIGHT, "indirect") for asset in (exact, stored))
     assert 0 < np.linalg.norm(one - other) < 3e-3 * np.linalg.norm(one)
 
@@ -197,17 +282,28 @@ def test_as_stored_is_done_once(assets):
 
 
 def test_bytes(assets, files):
-    """`compressed` holds what the file holds, entry by entry; with 16 bits these take half the bytes and sparse ones less than dense ones."""
+    """`compressed` holds what the file holds, entry by entry; with 16 bits these take half the
+    bytes and sparse ones less than dense ones.
+    """
     size = {}
     for name, asset in assets.items():
         arrays = compressed(asset)
         size[name] = sum(np.asarray(array).nbytes for array in arrays.values())
         with h5py.File(files[name]) as file:
-            assert {key for key in names_in(files[name]) if key.startswith(("depth", "transfer"))} == set(arrays)
+            assert {
+                key for key in names_in(files[name]) if key.startswith(("depth", "transfer"))
+            } == set(arrays)
             assert all(np.array_equal(file[key][()], array) for key, array in arrays.items())
-        points = sum(array.nbytes for key, array in arrays_of(asset).items() if key.startswith(("points", "lights")))
+        points = sum(
+            array.nbytes
+            for key, array in arrays_of(asset).items()
+            if key.startswith(("points", "lights"))
+        )
         assert size[name] < files[name].stat().st_size < size[name] + points + 40_000
-    assert size["16 dense"] < 0.55 * size["float32 dense"] and size["16 sparse"] < 0.6 * size["float32 sparse"]
+    assert (
+        size["16 dense"] < 0.55 * size["float32 dense"]
+        and size["16 sparse"] < 0.6 * size["float32 sparse"]
+    )
     assert size["16 sparse"] < size["16 dense"] and size["float32 sparse"] < size["float32 dense"]
 
 
@@ -227,11 +323,13 @@ def check_progress(events):
         assert done == sorted(done) and told[-1][0] == told[-1][1], stage
 
 
-# --- seeds ---------------------------------------------------------------------------------------------------------
+# --- seeds ----------------------------------------------------------------------------------------
 
 
 def test_seeds(files, tmp_path):
-    """The same seed gives the same bytes, whatever ran before; another one other samples and other bytes. On the way progress is told."""
+    """The same seed gives the same bytes, whatever ran before; another one other samples and other
+    bytes. On the way progress is told.
+    """
     events = {}
 
     def watch(stage, done, total, detail):
@@ -243,14 +341,18 @@ def test_seeds(files, tmp_path):
     other = precompute(seed=1, **STORAGE["16 sparse"])
     other.save(tmp_path / "other.prt")
     assert (tmp_path / "other.prt").read_bytes() != files["16 sparse"].read_bytes()
-    assert not np.array_equal(other.points.positions, mi_prt.load(files["16 sparse"]).points.positions)
+    assert not np.array_equal(
+        other.points.positions, mi_prt.load(files["16 sparse"]).points.positions
+    )
 
 
-# --- damaged and foreign files -------------------------------------------------------------------------------------
+# --- damaged and foreign files --------------------------------------------------------------------
 
 
 def damaged(path, copy, name, change):
-    """A copy of a file in which an array is replaced by `change(array)`, or left out where that is None."""
+    """A copy of a file in which an array is replaced by `change(array)`, or left out where that is
+    None.
+    """
     shutil.copy(path, copy)
     with h5py.File(copy, "r+") as file:
         value = change(file[name][()])
@@ -263,7 +365,9 @@ def damaged(path, copy, name, change):
 RESHAPED = {
     "removed": lambda array: None,
     "cut short": lambda array: array[:-1] if array.ndim else array[None],
-    "too long": lambda array: np.concatenate([array, array[-1:]]) if array.ndim else np.stack([array, array]),
+    "too long": lambda array: (
+        np.concatenate([array, array[-1:]]) if array.ndim else np.stack([array, array])
+    ),
     "deeper": lambda array: array[..., None],
 }
 HARMLESS = {("transfer/matrix_scale", "deeper")}  # of entries, each row has one scale in any case
@@ -272,7 +376,9 @@ HARMLESS = {("transfer/matrix_scale", "deeper")}  # of entries, each row has one
 @pytest.mark.parametrize("damage", RESHAPED)
 @pytest.mark.parametrize("storage", ["16 dense", "16 sparse", "float32 sparse"])
 def test_damaged_arrays(files, tmp_path, storage, damage):
-    """Whichever array is missing or of another shape, the file is refused in one line; not one of them is taken for another thing."""
+    """Whichever array is missing or of another shape, the file is refused in one line; not one of
+    them is taken for another thing.
+    """
     taken = []
     for name in names_in(files[storage]):
         path = damaged(files[storage], tmp_path / "damaged.prt", name, RESHAPED[damage])
@@ -286,17 +392,36 @@ def test_damaged_arrays(files, tmp_path, storage, damage):
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("transfer/rows", 1 << 31), ("transfer/columns", 65535), ("transfer/ends", 1 << 40), ("transfer/ends", -1), ("transfer/shape", 1000), ("clusters/starts", 1)],
+    [
+        ("transfer/rows", 1 << 31),
+        ("transfer/columns", 65535),
+        ("transfer/ends", 1 << 40),
+        ("transfer/ends", -1),
+        ("transfer/shape", 1000),
+        ("clusters/starts", 1),
+    ],
 )
 def test_places_beyond_the_arrays(files, tmp_path, name, value):
-    """Indices that point elsewhere: an AssetError, where reading on would end the process. Hence a process of its own."""
-    path = damaged(files["16 sparse"], tmp_path / "damaged.prt", name, lambda array: np.full_like(array, value))
-    program = f"import mi_prt\ntry:\n    mi_prt.load({str(path)!r})\nexcept mi_prt.AssetError:\n    print('refused')"
-    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
+    """Indices that point elsewhere: an AssetError, where reading on would end the process.
+
+    Hence a process of its own.
+    """
+    path = damaged(
+        files["16 sparse"], tmp_path / "damaged.prt", name, lambda array: np.full_like(array, value)
+    )
+    program = (
+        f"import mi_prt\ntry:\n    mi_prt.load({str(path)!r})\nexcept mi_prt.AssetError:\n   "
+        " print('refused')"
+    )
+    run = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=60
+    )
     assert (run.returncode, run.stdout.strip()) == (0, "refused"), run.stderr[-500:]
 
 
-@pytest.mark.parametrize("name", ["scene", "settings", "versions", "report", "format", "format_version", "complete"])
+@pytest.mark.parametrize(
+    "name", ["scene", "settings", "versions", "report", "format", "format_version", "complete"]
+)
 def test_damaged_texts(files, tmp_path, name):
     """Missing, or no JSON and no number: refused."""
     for value in (None, "{", np.zeros(2)):
@@ -332,24 +457,39 @@ def test_foreign_files(tmp_path):
 
 
 def test_both_kinds_of_files(files, tmp_path):
-    """Distant light has format version 3, as before there were others, and local light 4; `load` tells them apart. A file that says it is of the
-    other kind, or of a version yet to come, is refused."""
-    distant = mi_prt.precompute.precompute(SCENE, directions="cubemap:4", edge_length=0.5, coefficients=4, bounces=0)
+    """Distant light has format version 3, as before there were others, and local light 4; `load`
+    tells them apart. A file that says it is of the other kind, or of a version yet to come, is
+    refused.
+    """
+    distant = mi_prt.precompute(
+        SCENE, directions="cubemap:4", edge_length=0.5, coefficients=4, bounces=0
+    )
     distant.save(tmp_path / "distant.prt")
     loaded = mi_prt.load(tmp_path / "distant.prt")
-    assert isinstance(loaded, mi_prt.Asset) and isinstance(mi_prt.load(files["16 dense"]), MeshlessAsset)
-    np.testing.assert_array_equal(loaded.irradiance(uniform_sky()), distant.irradiance(uniform_sky()))
+    assert isinstance(loaded, mi_prt.Asset) and isinstance(
+        mi_prt.load(files["16 dense"]), MeshlessAsset
+    )
+    np.testing.assert_array_equal(
+        loaded.irradiance(uniform_sky()), distant.irradiance(uniform_sky())
+    )
     for path, version, other in ((tmp_path / "distant.prt", 3, 4), (files["16 dense"], 4, 3)):
         for wrong in (other, 2, 99):
             shutil.copy(path, tmp_path / "wrong.prt")
             with h5py.File(tmp_path / "wrong.prt", "r+") as file:
                 assert file.attrs["format_version"] == version
                 file.attrs["format_version"] = wrong
-            with pytest.raises(AssetError, match="truncated or no" if wrong == other else f"format version {wrong}, this program reads 3 and 4"):
+            with pytest.raises(
+                AssetError,
+                match=(
+                    "truncated or no"
+                    if wrong == other
+                    else f"format version {wrong}, this program reads 3 and 4"
+                ),
+            ):
                 mi_prt.load(tmp_path / "wrong.prt")
 
 
-# --- light ---------------------------------------------------------------------------------------------------------
+# --- light ----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -378,89 +518,166 @@ def test_components(assets, component):
 
 @pytest.mark.parametrize("component", ["total", "direct", "indirect"])
 def test_own_emitters_by_default(assets, component):
-    """No light given: the lamp (64 places) and the bulb of the scene, exactly as if they were passed."""
+    """No light given: the lamp (64 places) and the bulb of the scene, exactly as if they were
+    passed.
+    """
     asset = assets["16 dense"]
     light = local_scene_light(open_scene(SCENE))
     assert len(asset.own_light) == 65
-    np.testing.assert_array_equal(asset.irradiance(component=component), asset.irradiance(light, component))
+    np.testing.assert_array_equal(
+        asset.irradiance(component=component), asset.irradiance(light, component)
+    )
     bulb = PointLight((0.4, 0.3, 0.2), (0.5, 1.0, 2.0))
-    assert (asset.irradiance(component="direct") >= asset.irradiance(bulb, "direct") * (1 - 1e-5)).all()
+    assert (
+        asset.irradiance(component="direct") >= asset.irradiance(bulb, "direct") * (1 - 1e-5)
+    ).all()
 
 
 def test_emitters_that_cannot_be_taken(tmp_path):
-    """A projector is local and not supported: the run goes through, and says so only when that light is asked for."""
-    projector = {"type": "projector", "irradiance": {"type": "rgb", "value": 1.0}, "to_world": mi.ScalarTransform4f().translate([0, 0, 2])}
+    """A projector is local and not supported: the run goes through, and says so only when that
+    light is asked for.
+    """
+    projector = {
+        "type": "projector",
+        "irradiance": {"type": "rgb", "value": 1.0},
+        "to_world": mi.ScalarTransform4f().translate([0, 0, 2]),
+    }
     asset = precompute(SCENE | dict(projector=projector), count=200, bounces=0)
     asset.irradiance(LIGHT)
     with pytest.raises(LightError, match="pass a light instead"):
         asset.irradiance()
 
 
-# --- settings ------------------------------------------------------------------------------------------------------
+# --- settings -------------------------------------------------------------------------------------
 
 BAD = [
-    dict(count=0), dict(count=1_000_001), dict(count=1.5), dict(count=True), dict(count="100"), dict(count=None), dict(count=float("nan")),
-    dict(cluster_size=0), dict(cluster_size=-5), dict(depth_directions=15), dict(depth_directions=17), dict(depth_directions=1 << 17),
-    dict(depth_coefficients=0), dict(depth_coefficients=5000), dict(example_lights=0), dict(example_lights=1_000_000), dict(transfer_coefficients=0),
-    dict(transfer_coefficients=2000), dict(transfer_error=-0.1), dict(transfer_error=1), dict(transfer_error=float("nan")),
-    dict(transfer_error=float("inf")), dict(transfer_error="much"), dict(transfer_error=None), dict(quantize="8"), dict(quantize=None),
-    dict(bounces=-1), dict(bounces=1.0), dict(bounces="all"), dict(bounces=10_001), dict(bounces=True), dict(seed=-1), dict(seed=1 << 31),
+    dict(count=0),
+    dict(count=1_000_001),
+    dict(count=1.5),
+    dict(count=True),
+    dict(count="100"),
+    dict(count=None),
+    dict(count=float("nan")),
+    dict(cluster_size=0),
+    dict(cluster_size=-5),
+    dict(depth_directions=15),
+    dict(depth_directions=17),
+    dict(depth_directions=1 << 17),
+    dict(depth_coefficients=0),
+    dict(depth_coefficients=5000),
+    dict(example_lights=0),
+    dict(example_lights=1_000_000),
+    dict(transfer_coefficients=0),
+    dict(transfer_coefficients=2000),
+    dict(transfer_error=-0.1),
+    dict(transfer_error=1),
+    dict(transfer_error=float("nan")),
+    dict(transfer_error=float("inf")),
+    dict(transfer_error="much"),
+    dict(transfer_error=None),
+    dict(quantize="8"),
+    dict(quantize=None),
+    dict(bounces=-1),
+    dict(bounces=1.0),
+    dict(bounces="all"),
+    dict(bounces=10_001),
+    dict(bounces=True),
+    dict(seed=-1),
+    dict(seed=1 << 31),
     dict(seed="x"),
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize("bad", BAD, ids=lambda bad: "=".join(map(str, *bad.items())))
 def test_bad_settings(bad):
-    """Each is refused by its name, in one line, before any work: precompute does not look at the scene, which there is none."""
+    """Each is refused by its name, in one line, before any work: precompute does not look at the
+    scene, which there is none.
+    """
     name = next(iter(bad))
     with pytest.raises(SettingsError) as caught:
-        mi_prt.precompute.precompute("no such scene.xml", points="samples", **bad)
+        mi_prt.precompute("no such scene.xml", points="samples", **bad)
     assert name.split("_")[0] in str(caught.value) and "\n" not in str(caught.value)
 
 
 def test_settings_are_stored_as_plain_numbers():
     """NumPy's integers, and what stands for 'any number' of bounces."""
     settings = MeshlessSettings(count=np.int64(50), transfer_error="0.5", quantize=16, bounces=None)
-    assert (settings.count, settings.transfer_error, settings.quantize, settings.bounces) == (50, 0.5, "16", "auto")
-    assert type(settings.count) is int and MeshlessSettings(count=1, depth_directions=16, bounces=0).bounces == 0
+    assert (settings.count, settings.transfer_error, settings.quantize, settings.bounces) == (
+        50,
+        0.5,
+        "16",
+        "auto",
+    )
+    assert (
+        type(settings.count) is int
+        and MeshlessSettings(count=1, depth_directions=16, bounces=0).bounces == 0
+    )
 
 
-@pytest.mark.parametrize(("points", "setting"), [("samples", "edge_length"), ("samples", "basis"), ("samples", "directions"), ("vertices", "count"),
-                                                 ("vertices", "quantize"), ("samples", "colour")])  # fmt: skip
+@pytest.mark.parametrize(
+    ("points", "setting"),
+    [
+        ("samples", "edge_length"),
+        ("samples", "basis"),
+        ("samples", "directions"),
+        ("vertices", "count"),
+        ("vertices", "quantize"),
+        ("samples", "colour"),
+    ],
+)
 def test_settings_of_the_other_kind_of_points(points, setting):
     """Refused by name, with those that there are."""
     with pytest.raises(SettingsError, match=f"{setting} is no setting of points '{points}'"):
-        mi_prt.precompute.precompute(SCENE, points=points, **{setting: 1})
+        mi_prt.precompute(SCENE, points=points, **{setting: 1})
 
 
 @pytest.mark.parametrize("points", ["meshless", "", None, "Samples"])
 def test_points_that_are_not_known(points):
     with pytest.raises(SettingsError, match="use vertices or samples"):
-        mi_prt.precompute.precompute(SCENE, points=points)
+        mi_prt.precompute(SCENE, points=points)
 
 
 def test_fewer_samples_than_anything_else(tmp_path):
-    """One sample, one cluster, more components and examples than there are samples: small, but whole and finite, and it is read again."""
-    asset = precompute(count=1, cluster_size=1000, depth_coefficients=50, transfer_coefficients=20, example_lights=3)
+    """One sample, one cluster, more components and examples than there are samples: small, but
+    whole and finite, and it is read again.
+    """
+    asset = precompute(
+        count=1,
+        cluster_size=1000,
+        depth_coefficients=50,
+        transfer_coefficients=20,
+        example_lights=3,
+    )
     asset.save(tmp_path / "a.prt")
     result = mi_prt.load(tmp_path / "a.prt").irradiance(LIGHT)
-    assert len(asset.points) == len(result) == len(asset.samples.roots) == 1 and np.isfinite(result).all()
+    assert (
+        len(asset.points) == len(result) == len(asset.samples.roots) == 1
+        and np.isfinite(result).all()
+    )
 
 
-# --- memory and interruptions --------------------------------------------------------------------------------------
+# --- memory and interruptions ---------------------------------------------------------------------
 
 
 def test_too_little_memory_is_refused_before_the_work(tmp_path):
-    """No more than the samples were found: no ray is traced for depth or light, and nothing is left behind."""
+    """No more than the samples were found: no ray is traced for depth or light, and nothing is left
+    behind.
+    """
     stages = set()
     with pytest.raises(SettingsError, match=r"max_memory \(--max-memory\)") as caught:
-        precompute(max_memory="50M", output=tmp_path / "a.prt", progress=lambda stage, *_: stages.add(stage))
+        precompute(
+            max_memory="50M",
+            output=tmp_path / "a.prt",
+            progress=lambda stage, *_: stages.add(stage),
+        )
     assert stages <= {"samples"} and os.listdir(tmp_path) == [] and "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("stage", ["example lights", "importance", "clusters", "reflections"])
 def test_interrupts_keep_what_was_computed(files, tmp_path, stage):
-    """Ctrl-C in each stage: no file; then the run goes on, clusters that are there are not traced again, and the file is the same to the byte."""
+    """Ctrl-C in each stage: no file; then the run goes on, clusters that are there are not traced
+    again, and the file is the same to the byte.
+    """
     path, events = tmp_path / "a.prt", []
 
     def interrupt(at, done, total, detail):
@@ -474,12 +691,23 @@ def test_interrupts_keep_what_was_computed(files, tmp_path, stage):
         with pytest.raises(SettingsError, match="--resume"):
             precompute(output=path, **STORAGE["16 sparse"])
         with pytest.raises(SettingsError, match="depth_coefficients was 8, now 9"):
-            precompute(output=path, resume=True, **STORAGE["16 sparse"] | dict(depth_coefficients=9))
-    precompute(output=path, resume=True, progress=lambda *event: events.append(event), **STORAGE["16 sparse"])
+            precompute(
+                output=path, resume=True, **STORAGE["16 sparse"] | dict(depth_coefficients=9)
+            )
+    precompute(
+        output=path,
+        resume=True,
+        progress=lambda *event: events.append(event),
+        **STORAGE["16 sparse"],
+    )
     traced = [detail for at, _, _, detail in events if at == "clusters" and detail]
-    assert len(traced) == {"example lights": 10, "importance": 10, "clusters": 5, "reflections": 0}[stage] or stage == "clusters" and 0 < len(traced) < 8
+    assert len(traced) == {"example lights": 10, "importance": 10, "clusters": 5, "reflections": 0}[
+        stage
+    ] or (stage == "clusters" and 0 < len(traced) < 8)
     assert ("example lights" in [at for at, *_ in events]) == (stage == "example lights")
-    assert path.read_bytes() == files["16 sparse"].read_bytes() and os.listdir(tmp_path) == ["a.prt"]
+    assert path.read_bytes() == files["16 sparse"].read_bytes() and os.listdir(tmp_path) == [
+        "a.prt"
+    ]
 
 
 PROGRAM = """
@@ -494,10 +722,15 @@ precompute(output=sys.argv[2], resume=True, progress=progress, **STORAGE["16 spa
 
 
 def test_a_killed_run_ends_in_the_same_file(files, tmp_path):
-    """SIGKILL while clusters are traced: no file is there, and what the next run leaves is the same to the byte."""
+    """SIGKILL while clusters are traced: no file is there, and what the next run leaves is the same
+    to the byte.
+    """
     path = tmp_path / "a.prt"
     process = subprocess.Popen(
-        [sys.executable, "-c", PROGRAM, os.path.dirname(__file__), str(path)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [sys.executable, "-c", PROGRAM, os.path.dirname(__file__), str(path)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
     )
     line = "start"
     while line and not line.startswith("clusters"):

@@ -1,6 +1,7 @@
 """Raster images: they show what the integrator `prt` shows, and what closed forms say.
 
-Most tests set the irradiance at the points by hand, so they need no transport: points stand in for an asset.
+Most tests set the irradiance at the points by hand, so they need no transport: points stand in for
+an asset.
 """
 
 import os
@@ -21,8 +22,8 @@ from mi_prt.points.points import sample_points
 from mi_prt.render.display import display, exposure
 from mi_prt.render.image import render_image, resized
 from mi_prt.render.raster import RasterScene, render_raster
-from mi_prt.system.runtime import mitsuba
 from mi_prt.scene.scene import open_scene
+from mi_prt.system.runtime import mitsuba
 
 SCENES = Path(__file__).resolve().parents[1] / "scenes"
 
@@ -32,7 +33,11 @@ def film(width=48, height=36, **rest):
 
 
 def camera(origin=(0, 4, 0.1), target=(0, 0, 0), kind="perspective", film=film(), **rest):
-    look = mitsuba().ScalarTransform4f().look_at(origin=list(origin), target=list(target), up=[0, 0, -1])
+    look = (
+        mitsuba()
+        .ScalarTransform4f()
+        .look_at(origin=list(origin), target=list(target), up=[0, 0, -1])
+    )
     if kind == "orthographic":
         look = look @ mitsuba().ScalarTransform4f().scale([1.1, 1.1, 1])
     return {"type": kind, "to_world": look, "film": film, **rest}
@@ -43,7 +48,9 @@ def opened(edge_length=0.25, sensor=None, **parts):
     opened = open_scene(scene(sensor=sensor or camera(), **parts))
     points = sample_points(opened, edge_length)
     lit = np.full((len(points), 3), np.pi, np.float32)
-    asset = SimpleNamespace(points=points, buried=np.zeros(len(points), bool), irradiance=lambda light: lit, path=None)
+    asset = SimpleNamespace(
+        points=points, buried=np.zeros(len(points), bool), irradiance=lambda light: lit, path=None
+    )
     asset.interpolator = lambda scene: PatchInterpolator(scene, points, asset.buried)
     return opened, asset, opened.mi_scene.sensors()[0]
 
@@ -54,7 +61,9 @@ def linear(asset, opened, sensor, irradiance, samples=2):
 
 
 def hits(opened, sensor):
-    """Mitsuba's intersections along the rays through the pixels' centres, in the order of the pixels."""
+    """Mitsuba's intersections along the rays through the pixels' centres, in the order of the
+    pixels.
+    """
     mi = mitsuba()
     width, height = sensor.film().crop_size()
     row, column = np.indices((height, width)).reshape(2, -1)
@@ -63,11 +72,12 @@ def hits(opened, sensor):
     return opened.mi_scene.ray_intersect(ray), np.array(ray.d).T
 
 
-# --- against the integrator ------------------------------------------------------------------------------------------
+# --- against the integrator -----------------------------------------------------------------------
 
 
 def inside_surfaces(opened, sensor):
-    """Pixels (h, w) with no outline or crease in their 3x3 neighbourhood: one shape, and normals within 15 degrees.
+    """Pixels (h, w) with no outline or crease in their 3x3 neighbourhood: one shape, and normals
+    within 15 degrees.
 
     Shapes and normals are compared at the corners of the pixels, of which a neighbourhood has 4x4.
     """
@@ -78,7 +88,9 @@ def inside_surfaces(opened, sensor):
     row, column = np.indices((height + 3, width + 3)).reshape(2, -1) - 1.0
     image = mi.Point2f(np.stack([column / width, row / height]).astype(np.float32))
     si = opened.mi_scene.ray_intersect(sensor.sample_ray(0.0, 0.5, image, mi.Point2f(0.5))[0])
-    shape = np.stack([np.array(dr.reinterpret_array(mi.UInt32, x)) for x in (si.shape, si.instance)], axis=-1)
+    shape = np.stack(
+        [np.array(dr.reinterpret_array(mi.UInt32, x)) for x in (si.shape, si.instance)], axis=-1
+    )
     shape = shape.reshape(height + 3, width + 3, 2)
     normal = np.array(si.n).T.reshape(height + 3, width + 3, 3)
     corners = [(slice(i, i + height), slice(j, j + width)) for i in range(4) for j in range(4)]
@@ -87,18 +99,23 @@ def inside_surfaces(opened, sensor):
     return same & (spread < np.sin(np.radians(15)))
 
 
-@pytest.mark.parametrize("name, mean, high", [("still_life", 0.004, 0.04), ("teapot", 0.0003, 0.004)])
+@pytest.mark.parametrize(
+    "name, mean, high", [("still_life", 0.004, 0.04), ("teapot", 0.0003, 0.004)]
+)
 def test_agrees_with_the_integrator(name, mean, high):
     """Outside outlines the two images are the same, in display values 0…1.
 
-    Rationale: both interpolate the same irradiance on the same triangles, one in hardware, one in closed form. The
-    teapot has no textures, so only rounding and the shading across a pixel's four samples are left (below 1/255 at
-    the 99th percentile). In the still life, planks and checks have edges that cross pixels: a pixel of contrast 0.5 has
-    a standard error of 0.25/√64 = 0.03 in the integrator's image and steps of a quarter in the raster's. Those errors
-    have no sign, so the bias stays small. Measured: mean 0.0021 and 0.00014, 99th percentile 0.028 and 0.0015.
+    Rationale: both interpolate the same irradiance on the same triangles, one in hardware, one in
+    closed form. The teapot has no textures, so only rounding and the shading across a pixel's four
+    samples are left (below 1/255 at the 99th percentile). In the still life, planks and checks have
+    edges that cross pixels: a pixel of contrast 0.5 has a standard error of 0.25/√64 = 0.03 in the
+    integrator's image and steps of a quarter in the raster's. Those errors have no sign, so the
+    bias stays small. Measured: mean 0.0021 and 0.00014, 99th percentile 0.028 and 0.0015.
     """
     opened = open_scene(SCENES / f"{name}.xml")
-    asset = mi_prt.precompute.precompute(opened, directions="cubemap:16", coefficients=32, bounces=0)  # any irradiance will do
+    asset = mi_prt.precompute(
+        opened, directions="cubemap:16", coefficients=32, bounces=0
+    )  # any irradiance will do
     irradiance = asset.irradiance(scene_light(opened))
     factor = exposure(asset.outgoing_radiance(irradiance))
     with resized(opened.mi_scene.sensors()[0], (320, 240)) as sensor:
@@ -108,7 +125,10 @@ def test_agrees_with_the_integrator(name, mean, high):
     error = np.abs(raster - reference).max(axis=-1)
     assert raster.dtype == np.float32 and raster.shape == (240, 320, 3)
     assert inside.mean() > 0.8
-    print(f"{name}: mean {error[inside].mean():.5f}, 99th percentile {np.quantile(error[inside], 0.99):.5f}")
+    print(
+        f"{name}: mean {error[inside].mean():.5f}, 99th percentile"
+        f" {np.quantile(error[inside], 0.99):.5f}"
+    )
     assert error[inside].mean() < mean
     assert np.quantile(error[inside], 0.99) < high
     assert abs((raster - reference)[inside].mean()) < mean / 5
@@ -120,13 +140,15 @@ def two_sided(front, back):
 
 
 def test_agrees_with_the_integrator_on_lights_textures_and_either_side():
-    """Area lights, a rotated bitmap, its seam on a sphere, flipped normals, both sides of a disk, and one-sided backs.
+    """Area lights, a rotated bitmap, its seam on a sphere, flipped normals, both sides of a disk,
+    and one-sided backs.
 
-    Set-up: all points have irradiance π, so radiance is albedo; one sample per pixel, compared with what Mitsuba's own
-    emitters and materials give at the pixel's centre. Expectation: the same up to half precision (2⁻¹¹) away from
-    textures; where the bitmap has a kink (twice in 3 pixels here), the texture's filter, half a pixel wide, rounds it:
-    up to an eighth of the change in slope there, 0.03. Single pixels on outlines may fall on the other side. Measured:
-    98.9 % within 0.03, mean 0.002.
+    Set-up: all points have irradiance π, so radiance is albedo; one sample per pixel, compared with
+    what Mitsuba's own emitters and materials give at the pixel's centre. Expectation: the same up
+    to half precision (2⁻¹¹) away from textures; where the bitmap has a kink (twice in 3 pixels
+    here), the texture's filter, half a pixel wide, rounds it: up to an eighth of the change in
+    slope there, 0.03. Single pixels on outlines may fall on the other side. Measured: 98.9 % within
+    0.03, mean 0.002.
     """
     mi = mitsuba()
     texels = np.random.default_rng(3).uniform(0, 1, (6, 9, 3)).astype(np.float32)
@@ -163,11 +185,15 @@ def test_agrees_with_the_integrator_on_lights_textures_and_either_side():
 
 @pytest.mark.parametrize("reverse", [False, True])
 def test_side_is_that_of_the_shading_normal(reverse, tmp_path):
-    """A one-sided quad whose winding disagrees with its normals is lit on the side of its normals, as in Mitsuba."""
+    """A one-sided quad whose winding disagrees with its normals is lit on the side of its normals,
+    as in Mitsuba.
+    """
     mi = mitsuba()
     mesh = mi.Mesh("quad", 4, 2, has_vertex_normals=True)
     parameters = mi.traverse(mesh)
-    parameters["vertex_positions"] = np.array([[-1, 0, -1], [1, 0, -1], [1, 0, 1], [-1, 0, 1]], np.float32).ravel()
+    parameters["vertex_positions"] = np.array(
+        [[-1, 0, -1], [1, 0, -1], [1, 0, 1], [-1, 0, 1]], np.float32
+    ).ravel()
     parameters["faces"] = np.array([0, 1, 2, 0, 2, 3] if reverse else [0, 2, 1, 0, 3, 2], np.uint32)
     parameters["vertex_normals"] = np.tile(np.float32([0, 1, 0]), 4)
     parameters.update()
@@ -175,15 +201,24 @@ def test_side_is_that_of_the_shading_normal(reverse, tmp_path):
     quad = {"type": "ply", "filename": str(tmp_path / "quad.ply"), "bsdf": diffuse(0.5)}
     for height, expected in ((4, 0.5), (-4, 0.0)):
         scene, asset, sensor = opened(sensor=camera((0, height, 0.1), fov=20), quad=quad)
-        assert linear(asset, scene, sensor, asset.irradiance(None)) == pytest.approx(expected, abs=1e-6)
+        assert linear(asset, scene, sensor, asset.irradiance(None)) == pytest.approx(
+            expected, abs=1e-6
+        )
 
 
-# --- closed forms ----------------------------------------------------------------------------------------------------
+# --- closed forms ---------------------------------------------------------------------------------
 
 SENSORS = {
     "perspective": {"fov": 40},
-    "shifted": {"fov": 50, "fov_axis": "y", "principal_point_offset_x": 0.2, "principal_point_offset_y": -0.1},
-    "cropped": {"film": film(64, 48, crop_width=30, crop_height=20, crop_offset_x=20, crop_offset_y=5)},
+    "shifted": {
+        "fov": 50,
+        "fov_axis": "y",
+        "principal_point_offset_x": 0.2,
+        "principal_point_offset_y": -0.1,
+    },
+    "cropped": {
+        "film": film(64, 48, crop_width=30, crop_height=20, crop_offset_x=20, crop_offset_y=5)
+    },
     "orthographic": {"kind": "orthographic"},
     "thinlens": {"kind": "thinlens", "aperture_radius": 0.3, "focus_distance": 4.0},
 }
@@ -191,11 +226,13 @@ SENSORS = {
 
 @pytest.mark.parametrize("name", SENSORS)
 def test_every_sensor_sees_a_linear_field_exactly(name):
-    """Irradiance that is linear in position is reproduced by linear interpolation, at each pixel's own hit.
+    """Irradiance that is linear in position is reproduced by linear interpolation, at each pixel's
+    own hit.
 
-    Set-up: a floor and a tilted plate above it, whose irradiance is e(x) = 4 + (x, y, z). Expectation: radiance is
-    0.5/π · e at Mitsuba's hit, to single precision (2e-5 relative), but at the few pixels that an edge crosses within
-    rounding. A projection wrong by a hundredth of a pixel gives errors of 3e-4.
+    Set-up: a floor and a tilted plate above it, whose irradiance is e(x) = 4 + (x, y, z).
+    Expectation: radiance is 0.5/π · e at Mitsuba's hit, to single precision (2e-5 relative), but at
+    the few pixels that an edge crosses within rounding. A projection wrong by a hundredth of a
+    pixel gives errors of 3e-4.
     """
     options = SENSORS[name]
     scene, asset, sensor = opened(
@@ -218,12 +255,16 @@ def test_every_sensor_sees_a_linear_field_exactly(name):
 
 
 def test_background_is_the_environment():
-    """Uncovered pixels show what Mitsuba's emitter gives along the sensor's rays; a pixel is the mean of its samples.
+    """Uncovered pixels show what Mitsuba's emitter gives along the sensor's rays; a pixel is the
+    mean of its samples.
 
-    With one sample the ray goes through the pixel's centre, so both are the same number up to the single precision of
-    the direction, times a gradient of the sky of at most 3 per radian. Without environment the background is black.
+    With one sample the ray goes through the pixel's centre, so both are the same number up to the
+    single precision of the direction, times a gradient of the sky of at most 3 per radian. Without
+    environment the background is black.
     """
-    sky = sky_of(lambda d: np.stack([2 + d[:, 0], 1 + 0.5 * np.sin(3 * d[:, 1]), 1.5 - d[:, 2]], axis=-1))
+    sky = sky_of(
+        lambda d: np.stack([2 + d[:, 0], 1 + 0.5 * np.sin(3 * d[:, 1]), 1.5 - d[:, 2]], axis=-1)
+    )
     envmap = {"type": "envmap", "bitmap": mitsuba().Bitmap(sky)}
     ball = sphere(radius=0.3, bsdf=diffuse(0.0))
     scene, asset, sensor = opened(sensor=camera((0, 2, 3)), sky=envmap, ball=ball)
@@ -235,7 +276,9 @@ def test_background_is_the_environment():
     expected = emitted(scene.mi_scene.environment(), directions)
     np.testing.assert_allclose(one[away], expected[away], atol=2e-5)
     assert np.mean(one[~away] == 0) > 0.9  # pixels on the ball; it is a polygon
-    np.testing.assert_allclose(linear(asset, scene, sensor, black, samples=3).mean(), one.mean(), rtol=0.02)
+    np.testing.assert_allclose(
+        linear(asset, scene, sensor, black, samples=3).mean(), one.mean(), rtol=0.02
+    )
 
     bare, asset, sensor = opened(sensor=camera((0, 2, 3)), ball=ball)
     assert not linear(asset, bare, sensor, black).any()
@@ -246,7 +289,9 @@ def test_background_is_the_environment():
 
 @pytest.mark.parametrize("height, expected", [(4, [0.2, 0.4, 0.6]), (-4, [0.5, 0.3, 0.1])])
 def test_each_side_has_its_own_light_and_albedo(height, expected):
-    """A two-sided plane fills the view; its front's irradiance is π, its back's 2π, so radiance is ρ and 2ρ."""
+    """A two-sided plane fills the view; its front's irradiance is π, its back's 2π, so radiance is
+    ρ and 2ρ.
+    """
     plane = rectangle(size=9, bsdf=two_sided([0.2, 0.4, 0.6], [0.25, 0.15, 0.05]))
     scene, asset, sensor = opened(sensor=camera((0, height, 0.1)), plane=plane)
     is_back = asset.points.normals[:, 1] < 0
@@ -259,13 +304,21 @@ def test_each_side_has_its_own_light_and_albedo(height, expected):
 def test_curved_shapes_have_no_dark_rims():
     """Albedo ½, irradiance π and a sky of ½ make every pixel ½, as in a furnace.
 
-    The triangles that stand for a ball or tube are seen at its outline where the ball's own normals look away. A coarse
-    lattice makes these rims wide.
+    The triangles that stand for a ball or tube are seen at its outline where the ball's own normals
+    look away. A coarse lattice makes these rims wide.
     """
-    tube = {"type": "cylinder", "p0": [-1, 0, 0.7], "p1": [1, 0, 0.7], "radius": 0.3, "bsdf": diffuse()}
+    tube = {
+        "type": "cylinder",
+        "p0": [-1, 0, 0.7],
+        "p1": [1, 0, 0.7],
+        "radius": 0.3,
+        "bsdf": diffuse(),
+    }
     plate = disk((1, 0.2, 0), (0.9, 0, -0.3), 0.4, bsdf=two_sided(0.5, 0.5))
     ball = sphere((-0.2, 0, -0.3), 0.6, bsdf=diffuse())
-    scene, asset, sensor = opened(0.5, ball=ball, tube=tube, plate=plate, sky={"type": "constant", "radiance": 0.5})
+    scene, asset, sensor = opened(
+        0.5, ball=ball, tube=tube, plate=plate, sky={"type": "constant", "radiance": 0.5}
+    )
     np.testing.assert_allclose(linear(asset, scene, sensor, asset.irradiance(None)), 0.5, rtol=1e-5)
 
 
@@ -273,19 +326,26 @@ def test_black_back_hides_what_is_behind():
     """Seen from behind, a one-sided plane is black; it is no hole."""
     plane = rectangle(size=9, bsdf=diffuse())
     scene, asset, sensor = opened(
-        sensor=camera((0, -4, 0.1)), plane=plane, ball=sphere((0, 2, 0), bsdf=diffuse()), sky={"type": "constant"}
+        sensor=camera((0, -4, 0.1)),
+        plane=plane,
+        ball=sphere((0, 2, 0), bsdf=diffuse()),
+        sky={"type": "constant"},
     )
     assert not linear(asset, scene, sensor, asset.irradiance(None)).any()
 
 
 def test_buried_points_give_their_share_to_the_others():
-    """Buried corners drop out of interpolation; where all corners are buried, they count as they are.
+    """Buried corners drop out of interpolation; where all corners are buried, they count as they
+    are.
 
-    Set-up: on a floor, points at x < 0 are buried and have irradiance 0, the others 1; the lattice has a column of points
-    at x = 0 or on either side. Expectation: a triangle with at least one corner at x ≥ 0 shows 1 all over, the others 0:
-    nothing in between, but for the weight 1e-5 of buried points, which matters in a sliver at the seam.
+    Set-up: on a floor, points at x < 0 are buried and have irradiance 0, the others 1; the lattice
+    has a column of points at x = 0 or on either side. Expectation: a triangle with at least one
+    corner at x ≥ 0 shows 1 all over, the others 0: nothing in between, but for the weight 1e-5 of
+    buried points, which matters in a sliver at the seam.
     """
-    scene, asset, sensor = opened(sensor=camera((0, 4, 0.1), fov=20), floor=rectangle(size=1, bsdf=diffuse(1.0)))
+    scene, asset, sensor = opened(
+        sensor=camera((0, 4, 0.1), fov=20), floor=rectangle(size=1, bsdf=diffuse(1.0))
+    )
     x = asset.points.positions[:, 0]
     asset.buried = x < 0
     irradiance = np.pi * np.where(asset.buried, 0.0, 1.0)[:, None] * np.ones(3)
@@ -295,16 +355,24 @@ def test_buried_points_give_their_share_to_the_others():
     assert 0.5 < (seen >= 0.999).mean() < 0.75  # half the floor and one column of triangles
     asset.irradiance = lambda light: irradiance
     scene_lit, _, sensor_lit = opened(
-        sensor=camera((0, 4, 0.1), fov=20), floor=rectangle(size=1, bsdf=diffuse(1.0)), sky={"type": "constant"}
+        sensor=camera((0, 4, 0.1), fov=20),
+        floor=rectangle(size=1, bsdf=diffuse(1.0)),
+        sky={"type": "constant"},
     )
     reference = render_image(asset, scene_lit.mi_scene, sensor_lit, spp=4)[..., 0]
     assert np.abs(seen - reference).mean() < 0.01
 
 
 def test_draws_again_under_other_light():
-    """One scene drawn three times: linear in irradiance, and back to the first image, bit for bit."""
-    scene, asset, sensor = opened(floor=rectangle(size=1, bsdf=diffuse()), ball=sphere(radius=0.4, bsdf=diffuse(0.3)))
-    irradiance = np.random.default_rng(1).uniform(0, 2, asset.points.positions.shape).astype(np.float32)
+    """One scene drawn three times: linear in irradiance, and back to the first image, bit for
+    bit.
+    """
+    scene, asset, sensor = opened(
+        floor=rectangle(size=1, bsdf=diffuse()), ball=sphere(radius=0.4, bsdf=diffuse(0.3))
+    )
+    irradiance = (
+        np.random.default_rng(1).uniform(0, 2, asset.points.positions.shape).astype(np.float32)
+    )
     with RasterScene(asset, scene, sensor) as raster:
         first, double, again = (raster.radiance(f * irradiance) for f in (1, 2, 1))
         shown = raster.draw(irradiance, 0.7)
@@ -314,7 +382,9 @@ def test_draws_again_under_other_light():
 
 
 def test_far_surfaces_do_not_fight():
-    """A sheet 2 mm above a floor is seen everywhere from 30 m away, with a near plane at 1 cm and a far one at 10 km."""
+    """A sheet 2 mm above a floor is seen everywhere from 30 m away, with a near plane at 1 cm and a
+    far one at 10 km.
+    """
     scene, asset, sensor = opened(
         edge_length=5.0,
         sensor=camera((0, 30, 1), near_clip=0.01, far_clip=1e4, fov=20),
@@ -324,13 +394,15 @@ def test_far_surfaces_do_not_fight():
     np.testing.assert_allclose(linear(asset, scene, sensor, asset.irradiance(None)), 0.9, rtol=1e-5)
 
 
-# --- refusals and platforms ------------------------------------------------------------------------------------------
+# --- refusals and platforms -----------------------------------------------------------------------
 
 
 def test_errors_name_what_is_supported():
     scene, asset, sensor = opened(floor=rectangle(bsdf=diffuse()))
     lit = asset.irradiance(None)
-    fluxmeter = open_scene({"type": "scene", "floor": rectangle(sensor={"type": "irradiancemeter", "film": film()})})
+    fluxmeter = open_scene(
+        {"type": "scene", "floor": rectangle(sensor={"type": "irradiancemeter", "film": film()})}
+    )
     with pytest.raises(SettingsError, match="perspective, thinlens, orthographic"):
         render_raster(asset, scene, lit, fluxmeter.mi_scene.sensors()[0], 1.0)
     with pytest.raises(SettingsError, match=r"shape \(\d+, 3\)"):
@@ -358,13 +430,17 @@ np.save(sys.argv[1], linear(asset, scene, sensor, asset.irradiance(None)))
 def test_platforms_draw_the_same(platform, tmp_path):
     """A process of its own for each platform, because it cannot be changed once OpenGL is loaded.
 
-    Coverage and interpolation follow one specification, but rounding is each driver's own: single samples on outlines
-    may fall on the other side.
+    Coverage and interpolation follow one specification, but rounding is each driver's own: single
+    samples on outlines may fall on the other side.
     """
     tests = Path(__file__).parent
     result = subprocess.run(
         [sys.executable, "-c", PROGRAM, str(tmp_path / "image.npy")],
-        env=os.environ | {"PYOPENGL_PLATFORM": platform, "PYTHONPATH": os.pathsep.join([str(tests), str(tests.parent)])},
+        env=os.environ
+        | {
+            "PYOPENGL_PLATFORM": platform,
+            "PYTHONPATH": os.pathsep.join([str(tests), str(tests.parent)]),
+        },
         capture_output=True,
         text=True,
         timeout=120,
@@ -373,7 +449,11 @@ def test_platforms_draw_the_same(platform, tmp_path):
         pytest.skip(result.stderr.strip().splitlines()[-1])
     assert result.returncode == 0, result.stderr
     scene, asset, sensor = opened(
-        floor=rectangle(bsdf=diffuse([0.2, 0.5, 0.8])), ball=sphere(radius=0.5, bsdf=diffuse()), sky={"type": "constant"}
+        floor=rectangle(bsdf=diffuse([0.2, 0.5, 0.8])),
+        ball=sphere(radius=0.5, bsdf=diffuse()),
+        sky={"type": "constant"},
     )
-    difference = np.abs(np.load(tmp_path / "image.npy") - linear(asset, scene, sensor, asset.irradiance(None))).max(axis=-1)
+    difference = np.abs(
+        np.load(tmp_path / "image.npy") - linear(asset, scene, sensor, asset.irradiance(None))
+    ).max(axis=-1)
     assert np.mean(difference > 1e-5) < 0.01

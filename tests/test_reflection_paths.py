@@ -1,4 +1,6 @@
-"""Rays of reflections: bias against Mitsuba's path tracer, how noise falls with their number, and noise taken out."""
+"""Rays of reflections: bias against Mitsuba's path tracer, how noise falls with their number, and
+noise taken out.
+"""
 
 import numpy as np
 import pytest
@@ -31,14 +33,21 @@ def two_sided(front, back=None):
 
 def checkers(one, other, count):
     colours = {f"color{i}": {"type": "rgb", "value": value} for i, value in enumerate((one, other))}
-    texture = {"type": "checkerboard", "to_uv": mi.ScalarTransform3f().scale([count, count]), **colours}
+    texture = {
+        "type": "checkerboard",
+        "to_uv": mi.ScalarTransform3f().scale([count, count]),
+        **colours,
+    }
     return {"type": "diffuse", "reflectance": texture}
 
 
 def bitmap(seed):
     """A material of 6 × 5 random colours."""
     pixels = np.random.default_rng(seed).uniform(0.1, 0.95, (6, 5, 3)).astype(np.float32)
-    return {"type": "diffuse", "reflectance": {"type": "bitmap", "bitmap": mi.Bitmap(pixels), "raw": True}}
+    return {
+        "type": "diffuse",
+        "reflectance": {"type": "bitmap", "bitmap": mi.Bitmap(pixels), "raw": True},
+    }
 
 
 def room():
@@ -54,14 +63,25 @@ def balls():
     return dict(
         floor=rectangle(size=2, bsdf=bitmap(2)),
         ball=sphere((0, 0.55, 0), 0.5, bsdf=checkers([0.95, 0.9, 0.2], [0.2, 0.3, 0.9], 4)),
-        roof=disk((0.2, -1, 0), (0, 1.6, 0), 1.0, bsdf=two_sided(diffuse([0.9, 0.5, 0.5]), diffuse([0.2, 0.9, 0.3]))),
+        roof=disk(
+            (0.2, -1, 0),
+            (0, 1.6, 0),
+            1.0,
+            bsdf=two_sided(diffuse([0.9, 0.5, 0.5]), diffuse([0.2, 0.9, 0.3])),
+        ),
     )
 
 
 def blocks(box=diffuse([0.9, 0.4, 0.2]), post=diffuse(0.0)):
-    blend = {"type": "blendbsdf", "weight": {"type": "checkerboard", "to_uv": mi.ScalarTransform3f().scale([4, 4])}}
+    blend = {
+        "type": "blendbsdf",
+        "weight": {"type": "checkerboard", "to_uv": mi.ScalarTransform3f().scale([4, 4])},
+    }
     return dict(
-        floor=rectangle(size=2, bsdf=blend | {"one": diffuse([0.9, 0.7, 0.3]), "other": diffuse([0.2, 0.5, 0.9])}),
+        floor=rectangle(
+            size=2,
+            bsdf=blend | {"one": diffuse([0.9, 0.7, 0.3]), "other": diffuse([0.2, 0.5, 0.9])},
+        ),
         box=cube((-0.5, 0.5, 0), 0.5, bsdf=box),
         post=cube((0.5, 0.3, 0.8), 0.3, bsdf=post),
         wall=rectangle((-1, 0, 0), (1, 1, 0), bsdf=two_sided(bitmap(3))),
@@ -69,8 +89,13 @@ def blocks(box=diffuse([0.9, 0.4, 0.2]), post=diffuse(0.0)):
 
 
 def glossy_blocks():
-    """Plastic, of which only the diffuse colour is modelled, and metal, which is modelled as black: as bright as `blocks`."""
-    plastic = {"type": "roughplastic", "diffuse_reflectance": {"type": "rgb", "value": [0.9, 0.4, 0.2]}}
+    """Plastic, of which only the diffuse colour is modelled, and metal, which is modelled as black:
+    as bright as `blocks`.
+    """
+    plastic = {
+        "type": "roughplastic",
+        "diffuse_reflectance": {"type": "rgb", "value": [0.9, 0.4, 0.2]},
+    }
     return blocks(plastic, {"type": "roughconductor", "alpha": 0.5})
 
 
@@ -81,13 +106,25 @@ def smooth_sky(d):
 
 
 def by_mitsuba(parts, points, bounces, paths, seed):
-    """Reflected irradiance (n, 3) at points under the smooth sky, and its standard error, by Mitsuba's path tracer."""
+    """Reflected irradiance (n, 3) at points under the smooth sky, and its standard error, by
+    Mitsuba's path tracer.
+    """
     sky = {"type": "envmap", "bitmap": mi.Bitmap(sky_of(smooth_sky))}
-    traced = mi.load_dict(scene(**parts, sky=sky, embree_use_robust_intersections=True), optimize=False, parallel=False)
-    depth = -1 if bounces is None else bounces + 1  # the ray that leaves the point is the first edge of a path of depth 1
+    traced = mi.load_dict(
+        scene(**parts, sky=sky, embree_use_robust_intersections=True),
+        optimize=False,
+        parallel=False,
+    )
+    # the ray that leaves the point is the first edge of a path of depth 1
+    depth = -1 if bounces is None else bounces + 1
     integrator = mi.load_dict({"type": "path", "max_depth": depth, "hide_emitters": True})
-    directions = cosine_directions(np.random.default_rng(seed), np.repeat(points.normals.astype(float), paths, axis=0))
-    ray = mi.Ray3f(mi.Point3f(np.repeat(points.ray_origins(1e-4), paths, axis=0).T), mi.Vector3f(directions.T.astype(np.float32)))
+    directions = cosine_directions(
+        np.random.default_rng(seed), np.repeat(points.normals.astype(float), paths, axis=0)
+    )
+    ray = mi.Ray3f(
+        mi.Point3f(np.repeat(points.ray_origins(1e-4), paths, axis=0).T),
+        mi.Vector3f(directions.T.astype(np.float32)),
+    )
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(seed, len(directions))
     radiance = mi.Color3f(integrator.sample(traced, sampler, mi.RayDifferential3f(ray))[0])
@@ -95,7 +132,7 @@ def by_mitsuba(parts, points, bounces, paths, seed):
     return samples.mean(axis=1), samples.std(axis=1) / paths**0.5
 
 
-# --- bias ----------------------------------------------------------------------------------------------------------
+# --- bias -----------------------------------------------------------------------------------------
 
 TEXTURED = {
     "room": (room, room, 0.15, None),
@@ -106,11 +143,12 @@ TEXTURED = {
 
 @pytest.mark.parametrize("name", TEXTURED)
 def test_reflected_light_is_mitsubas(name):
-    """At 500 points of flat and analytic shapes, where Mitsuba's smooth normals play no part, with textures of every kind.
+    """At 500 points of flat and analytic shapes, where Mitsuba's smooth normals play no part, with
+    textures of every kind.
 
-    `paths` are unbiased: z-tests at 1 % of every point and channel (Šidák), and of the means. `solve` interpolates between
-    points: its bias is below 0.5 %, the reference's mean being known to 0.25 %. Points that see less than 5 % of other surfaces
-    have too few paths for a Gaussian.
+    `paths` are unbiased: z-tests at 1 % of every point and channel (Šidák), and of the means.
+    `solve` interpolates between points: its bias is below 0.5 %, the reference's mean being known
+    to 0.25 %. Points that see less than 5 % of other surfaces have too few paths for a Gaussian.
     """
     ours, theirs, edge_length, bounces = TEXTURED[name]
     count = 2048
@@ -134,19 +172,24 @@ def test_reflected_light_is_mitsubas(name):
 
 
 def test_rows_of_transport_hold_what_the_paths_bring():
-    """Σ_j w_j L_j T_ij over the cells of a row is the mean of what the paths bring from those cells; rows are linear in light."""
+    """Σ_j w_j L_j T_ij over the cells of a row is the mean of what the paths bring from those
+    cells; rows are linear in light.
+    """
     scene_ = sampled(scene(**room()), 0.5)
     index = np.arange(0, len(scene_.points), 3)
     sampler = scene_.paths(64, None, 3, seed=4)
     rows = sampler.transport(sampler.escapes(index))
-    light = smooth_sky(scene_.directions.vectors.astype(float)) * scene_.directions.solid_angles[:, None]
+    light = (
+        smooth_sky(scene_.directions.vectors.astype(float))
+        * scene_.directions.solid_angles[:, None]
+    )
     received = np.stack([row @ light[:, channel] for channel, row in enumerate(rows)], axis=-1)
     expected = scene_.samples_of_paths(64, None, index, smooth_sky, seed=4).mean(axis=1)
     np.testing.assert_allclose(received, expected, rtol=1e-5, atol=1e-6)
     assert all(row.data.min() >= 0 for row in rows)
 
 
-# --- convergence ---------------------------------------------------------------------------------------------------
+# --- convergence ----------------------------------------------------------------------------------
 
 
 def slope(counts, errors):
@@ -155,11 +198,12 @@ def slope(counts, errors):
 
 
 def test_noise_falls_with_the_number_of_rays():
-    """N^(−1/2) for the rows of `paths`, whose directions of escape nothing stratifies; irradiance and `solve` fall no slower.
+    """N^(−1/2) for the rows of `paths`, whose directions of escape nothing stratifies; irradiance
+    and `solve` fall no slower.
 
-    The error is the spread over four seeds, so it needs no reference; from 64 to 4,096 paths. Over hundreds of points and cells the
-    spread is known to about 1 %, the slope to 0.005. The first directions of paths are stratified, which helps irradiance a little,
-    and those of hops wholly.
+    The error is the spread over four seeds, so it needs no reference; from 64 to 4,096 paths. Over
+    hundreds of points and cells the spread is known to about 1 %, the slope to 0.005. The first
+    directions of paths are stratified, which helps irradiance a little, and those of hops wholly.
     """
     scene_ = sampled(scene(**room()), 0.5)
     index = np.arange(len(scene_.points))
@@ -173,7 +217,9 @@ def test_noise_falls_with_the_number_of_rays():
             sampler = scene_.paths(count, None, 3, seed)
             rows = [row.toarray() for row in sampler.transport(sampler.escapes(index))]
             estimates["rows"].append(rows[0] * np.sqrt(lattice.solid_angles))
-            estimates["irradiance"].append(np.stack([row @ (lattice.solid_angles * sky[:, c]) for c, row in enumerate(rows)]))
+            estimates["irradiance"].append(
+                np.stack([row @ (lattice.solid_angles * sky[:, c]) for c, row in enumerate(rows)])
+            )
             estimates["solve"].append(scene_.reflections(scene_.hops(count, seed), direct, 3, 3))
         for kind, values in estimates.items():
             spreads[kind].append(np.sqrt(np.var(values, axis=0, ddof=1).mean()))
@@ -184,11 +230,12 @@ def test_noise_falls_with_the_number_of_rays():
     assert spreads["solve"][0] < spreads["irradiance"][0]
 
 
-# --- what results must not depend on -------------------------------------------------------------------------------
+# --- what results must not depend on --------------------------------------------------------------
 
 
 def test_blocks_of_any_size_take_the_same_kernel_and_give_the_same_rows():
-    """After the first block, others of any number of points compile nothing; and how they are cut changes no bit.
+    """After the first block, others of any number of points compile nothing; and how they are cut
+    changes no bit.
 
     Only a block of a single point may compile one: Dr.Jit treats arrays of one entry as constants.
     """
@@ -199,8 +246,10 @@ def test_blocks_of_any_size_take_the_same_kernel_and_give_the_same_rows():
         return scene_.hops(32, lanes=32 * points).rays
 
     def paths(points, seed=0):
-        encode = lambda rows: (rows @ basis).astype(np.float32)  # noqa: E731
-        return np.concatenate(list(scene_.paths(32, 3, 3, seed, encode, lanes=32 * points).blocks()))
+        encode = lambda rows: (rows @ basis).astype(np.float32)
+        return np.concatenate(
+            list(scene_.paths(32, 3, 3, seed, encode, lanes=32 * points).blocks())
+        )
 
     whole = hops(10_000), paths(10_000)
     with count_kernels() as kernels:
@@ -215,7 +264,9 @@ def test_blocks_of_any_size_take_the_same_kernel_and_give_the_same_rows():
 
 @pytest.mark.parametrize("indirect", ["solve", "paths"])
 def test_points_and_seeds_have_rays_of_their_own(indirect):
-    """No two points of a wall share the random numbers of their rays, and no two seeds do, however large."""
+    """No two points of a wall share the random numbers of their rays, and no two seeds do, however
+    large.
+    """
     scene_ = sampled(scene(**room()), 0.5)
 
     def traced(seed):
@@ -229,40 +280,56 @@ def test_points_and_seeds_have_rays_of_their_own(indirect):
 
 
 def test_errors_of_neighbours_are_independent():
-    """The mean of n independent estimates has an n-th of their variance: χ² test at 1 % over 24 seeds, on one wall.
+    """The mean of n independent estimates has an n-th of their variance: χ² test at 1 % over 24
+    seeds, on one wall.
 
-    First directions that are stratified alike at all points pass every test of single points, and fail this one.
+    First directions that are stratified alike at all points pass every test of single points, and
+    fail this one.
     """
     scene_ = sampled(scene(**room()), 0.25)
     wall = np.flatnonzero(scene_.points.surface == 1)
-    estimates = np.array([scene_.samples_of_paths(64, 3, wall, seed=seed)[..., 0].mean(axis=1) for seed in range(24)])
+    estimates = np.array(
+        [scene_.samples_of_paths(64, 3, wall, seed=seed)[..., 0].mean(axis=1) for seed in range(24)]
+    )
     ratio = estimates.mean(axis=1).var(ddof=1) / (estimates.var(axis=0, ddof=1).mean() / len(wall))
     low, high = scipy.stats.chi2.interval(1 - FALSE_POSITIVES, 23)
     assert low < 23 * ratio < high
 
 
-# --- noise taken out -----------------------------------------------------------------------------------------------
+# --- noise taken out ------------------------------------------------------------------------------
 
 
 def halves_of(signal, noise, seed):
     """Two estimates (1, n, m) of a signal (n, m) with white noise of their own."""
     rng = np.random.default_rng(seed)
-    return [(signal + noise * rng.standard_normal(signal.shape)).astype(np.float32)[None] for _ in range(2)]
+    return [
+        (signal + noise * rng.standard_normal(signal.shape)).astype(np.float32)[None]
+        for _ in range(2)
+    ]
 
 
 def low_rank(points, components, seed):
-    """A signal (points, components) of rank 4 in no basis in particular, with singular values 8, 4, 2, 1 for each point."""
+    """A signal (points, components) of rank 4 in no basis in particular, with singular values 8, 4,
+    2, 1 for each point.
+    """
     rng = np.random.default_rng(seed)
     directions = np.linalg.qr(rng.standard_normal((components, 4)))[0].T
-    return rng.standard_normal((points, 4)) * [8.0, 4.0, 2.0, 1.0] @ directions + rng.standard_normal(components)
+    return rng.standard_normal((points, 4)) * [
+        8.0,
+        4.0,
+        2.0,
+        1.0,
+    ] @ directions + rng.standard_normal(components)
 
 
 @pytest.mark.parametrize("noise", [0.5, 2.0])
 def test_filter_comes_near_to_the_best_linear_one(noise):
-    """Of a signal with variances λ and noise of variance ν in the mean, no linear filter errs less than Σ λν/(λ + ν) (Wiener).
+    """Of a signal with variances λ and noise of variance ν in the mean, no linear filter errs less
+    than Σ λν/(λ + ν) (Wiener).
 
-    Unfiltered the error is mν. The filter must learn both variances from 4,000 points, of which it needs 16²: 10 % are allowed. It
-    tells the noise it found and let through; those are known within a few per cent.
+    Unfiltered the error is mν. The filter must learn both variances from 4,000 points, of which it
+    needs 16²: 10 % are allowed. It tells the noise it found and let through; those are known within
+    a few per cent.
     """
     n, m = 4000, 16
     signal = low_rank(n, m, seed=0)
@@ -280,7 +347,9 @@ def test_filter_comes_near_to_the_best_linear_one(noise):
 
 
 def test_filter_leaves_alone_what_has_no_noise():
-    """Equal halves come out bit for bit; and so, to rounding, does a quantity on which halves with noise elsewhere agree."""
+    """Equal halves come out bit for bit; and so, to rounding, does a quantity on which halves with
+    noise elsewhere agree.
+    """
     signal = low_rank(500, 12, seed=3)
     (half, _), kept = halves_of(signal, 0.0, 4), np.ones(500, bool)
     mean, size, passed = combined([half.copy(), half.copy()], kept)

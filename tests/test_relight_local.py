@@ -1,39 +1,51 @@
-"""Assets of local lights as pictures and films: the integrator, splats, the command line, comparison with Mitsuba, and the plugin."""
+"""Assets of local lights as pictures and films: the integrator, splats, the command line,
+comparison with Mitsuba, and the plugin.
+"""
 
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import bias, diffuse, relative_l2
 
 import mi_prt
-from conftest import bias, diffuse, relative_l2
 from mi_prt import LightError, SettingsError
 from mi_prt.cli import main
 from mi_prt.evaluate import ground_truth
 from mi_prt.lighting.scene_light import lit_scene
+from mi_prt.output.export import to_8bit
+from mi_prt.output.film import light_path
 from mi_prt.output.relight import relight_to_file
 from mi_prt.output.relight_local import animate_local
-from mi_prt.output.film import light_path
-from mi_prt.output.export import to_8bit
-from mi_prt.system.runtime import mitsuba
 from mi_prt.scene.scene import open_scene
+from mi_prt.system.runtime import mitsuba
 
 mi = mitsuba()
 LIGHT = mi_prt.PointLight((0.3, 0.6, 0.4), (3.0, 2.5, 2.0))
 SIZE = (48, 36)
 ROOM = Path(__file__).resolve().parent.parent / "scenes" / "room.xml"
-SETTINGS = {"points": "samples", "count": 3000, "cluster_size": 150, "depth_directions": 576, "example_lights": 200}
+SETTINGS = {
+    "points": "samples",
+    "count": 3000,
+    "cluster_size": 150,
+    "depth_directions": 576,
+    "example_lights": 200,
+}
 
 
 def wall(x, y, z, axis, degrees, bsdf, scale=(1, 1, 1)):
     T = mi.ScalarTransform4f
-    return {"type": "rectangle", "to_world": T().translate([x, y, z]).rotate(axis, degrees).scale(list(scale)), "bsdf": bsdf}
+    return {
+        "type": "rectangle",
+        "to_world": T().translate([x, y, z]).rotate(axis, degrees).scale(list(scale)),
+        "bsdf": bsdf,
+    }
 
 
 def room():
     """A room of 2 m, open to the sensor, with a box of red sides in it and a lamp of its own."""
-    two = lambda colour: {"type": "twosided", "bsdf": diffuse(colour)}  # noqa: E731
+    two = lambda colour: {"type": "twosided", "bsdf": diffuse(colour)}
     T = mi.ScalarTransform4f
     return {
         "type": "scene",
@@ -41,21 +53,34 @@ def room():
             "type": "perspective",
             "fov": 40,
             "to_world": T().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0]),
-            "film": {"type": "hdrfilm", "width": SIZE[0], "height": SIZE[1], "rfilter": {"type": "box"}},
+            "film": {
+                "type": "hdrfilm",
+                "width": SIZE[0],
+                "height": SIZE[1],
+                "rfilter": {"type": "box"},
+            },
         },
         "floor": wall(0, -1, 0, [1, 0, 0], -90, two(0.7)),
         "ceiling": wall(0, 1, 0, [1, 0, 0], 90, two(0.7)),
         "back": wall(0, 0, -1, [0, 1, 0], 0, two(0.6)),
         "left": wall(-1, 0, 0, [0, 1, 0], 90, two([0.7, 0.2, 0.1])),
         "right": wall(1, 0, 0, [0, 1, 0], -90, two([0.1, 0.6, 0.2])),
-        "box": {"type": "cube", "to_world": T().translate([-0.3, -0.6, -0.2]).rotate([0, 1, 0], 25).scale(0.4), "bsdf": diffuse(0.5)},
-        "lamp": {"type": "point", "position": [0.2, 0.8, 0.3], "intensity": {"type": "rgb", "value": [2.0, 2.0, 1.5]}},
+        "box": {
+            "type": "cube",
+            "to_world": T().translate([-0.3, -0.6, -0.2]).rotate([0, 1, 0], 25).scale(0.4),
+            "bsdf": diffuse(0.5),
+        },
+        "lamp": {
+            "type": "point",
+            "position": [0.2, 0.8, 0.3],
+            "intensity": {"type": "rgb", "value": [2.0, 2.0, 1.5]},
+        },
     }
 
 
 @pytest.fixture(scope="module")
 def asset(tmp_path_factory):
-    made = mi_prt.precompute.precompute(room(), **SETTINGS)
+    made = mi_prt.precompute(room(), **SETTINGS)
     made.save(tmp_path_factory.mktemp("asset") / "room.prt")
     return made
 
@@ -66,7 +91,9 @@ def opened():
 
 
 def image(path):
-    return np.array(mi.Bitmap(str(path)).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False))
+    return np.array(
+        mi.Bitmap(str(path)).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False)
+    )
 
 
 def truth(opened, light, spp=1024, depth=-1):
@@ -76,7 +103,10 @@ def truth(opened, light, spp=1024, depth=-1):
 
 @pytest.mark.parametrize("direct, limit", [("points", 0.12), ("pixels", 0.06)])
 def test_images_are_those_of_the_path_tracer(asset, opened, tmp_path, direct, limit):
-    """Of all pixels, against 1,024 samples (noise about 2 %). Direct light at pixels has no shadow that points would have to show."""
+    """Of all pixels, against 1,024 samples (noise about 2 %).
+
+    Direct light at pixels has no shadow that points would have to show.
+    """
     relight_to_file(asset, tmp_path / "a.exr", LIGHT, scene=room(), direct=direct, spp=64)
     expected = truth(opened, LIGHT)
     found = image(tmp_path / "a.exr")
@@ -85,7 +115,9 @@ def test_images_are_those_of_the_path_tracer(asset, opened, tmp_path, direct, li
 
 
 def test_components_add_up(asset, tmp_path):
-    """Light is a sum, and interpolation between points is linear: total = direct + indirect in each pixel."""
+    """Light is a sum, and interpolation between points is linear: total = direct + indirect in each
+    pixel.
+    """
     parts = {}
     for component in ("total", "direct", "indirect"):
         relight_to_file(asset, tmp_path / "a.exr", LIGHT, scene=room(), component=component, spp=4)
@@ -95,13 +127,25 @@ def test_components_add_up(asset, tmp_path):
 
 
 def test_direct_light_at_pixels_is_mitsubas(asset, opened, tmp_path):
-    """Without reflections nothing of the asset is in the image but its emission: shadow rays at the same kind of hits as Mitsuba's."""
-    relight_to_file(asset, tmp_path / "a.exr", LIGHT, scene=room(), component="direct", direct="pixels", spp=1024)
+    """Without reflections nothing of the asset is in the image but its emission: shadow rays at the
+    same kind of hits as Mitsuba's.
+    """
+    relight_to_file(
+        asset,
+        tmp_path / "a.exr",
+        LIGHT,
+        scene=room(),
+        component="direct",
+        direct="pixels",
+        spp=1024,
+    )
     assert relative_l2(image(tmp_path / "a.exr"), truth(opened, LIGHT, 1024, depth=2)) < 0.02
 
 
 def test_an_area_light_is_seen_and_shines(asset, tmp_path):
-    """It is a rectangle of its own radiance in the picture (here 5), and lights the room below it and not above."""
+    """It is a rectangle of its own radiance in the picture (here 5), and lights the room below it
+    and not above.
+    """
     light = mi_prt.AreaLight((0, 0, 0.5), (0.5, 0, 0), (0, 0.5, 0), 5.0)  # faces the sensor
     relight_to_file(asset, tmp_path / "a.exr", light, scene=room(), spp=16)
     picture = image(tmp_path / "a.exr")
@@ -109,7 +153,9 @@ def test_an_area_light_is_seen_and_shines(asset, tmp_path):
 
 
 def test_splats_show_what_the_integrator_shows(asset, tmp_path):
-    """Both interpolate the same irradiance between the same samples, with other weights: alike but for shadow edges."""
+    """Both interpolate the same irradiance between the same samples, with other weights: alike but
+    for shadow edges.
+    """
     relight_to_file(asset, tmp_path / "a.exr", LIGHT, scene=room(), spp=64)
     relight_to_file(asset, tmp_path / "b.exr", LIGHT, scene=room(), renderer="raster")
     assert relative_l2(image(tmp_path / "b.exr"), image(tmp_path / "a.exr")) < 0.06
@@ -125,7 +171,9 @@ def test_points_as_ply_and_npz(asset, tmp_path):
 
 
 def test_own_light_is_the_default_and_can_be_one_of_several(asset, tmp_path):
-    """The lamp of the scene is a point light: naming it, leaving it out, and passing its copy are the same; more lights add up."""
+    """The lamp of the scene is a point light: naming it, leaving it out, and passing its copy are
+    the same; more lights add up.
+    """
     lamp = mi_prt.PointLight((0.2, 0.8, 0.3), (2.0, 2.0, 1.5))
     own = asset.irradiance()
     np.testing.assert_allclose(asset.irradiance(lamp), own, rtol=1e-4, atol=1e-5)
@@ -134,7 +182,8 @@ def test_own_light_is_the_default_and_can_be_one_of_several(asset, tmp_path):
     found = {name: np.load(tmp_path / f"{name}.npz")["irradiance"] for name in "abc"}
     np.testing.assert_array_equal(found["a"], own)
     np.testing.assert_array_equal(found["b"], own)
-    assert relative_l2(found["c"], own + asset.irradiance(LIGHT)) < 0.01  # what is below zero is cut off in each
+    # what is below zero is cut off in each
+    assert relative_l2(found["c"], own + asset.irradiance(LIGHT)) < 0.01
 
 
 def test_plugin_follows_the_scenes_own_lamps(asset):
@@ -171,13 +220,27 @@ def test_comparison_tells_components(asset, tmp_path):
 def test_film_of_a_moving_light(asset, tmp_path, renderer):
     """Each frame is the picture of its place, at the first one's exposure."""
     path = light_path("-0.5,0.5,0.4 0.5,0.5,0.4")
-    told = animate_local(asset, tmp_path / "f-%d.png", path, 3, light=LIGHT, scene=room(), renderer=renderer, spp=4)
+    told = animate_local(
+        asset, tmp_path / "f-%d.png", path, 3, light=LIGHT, scene=room(), renderer=renderer, spp=4
+    )
     assert told["frames"] == 3
-    frames = [np.array(mi.Bitmap(str(tmp_path / f"f-{i}.png")).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, True)) for i in range(3)]
+    frames = [
+        np.array(
+            mi.Bitmap(str(tmp_path / f"f-{i}.png")).convert(
+                mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, True
+            )
+        )
+        for i in range(3)
+    ]
     single = mi_prt.PointLight((-0.5, 0.5, 0.4), LIGHT.intensity)
     relight_to_file(asset, tmp_path / "s.png", single, scene=room(), renderer=renderer, spp=4)
-    first = np.array(mi.Bitmap(str(tmp_path / "s.png")).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, True))
-    limit = 2 if renderer == "mitsuba" else 10  # splats of films have one sample a pixel, others four: outlines differ
+    first = np.array(
+        mi.Bitmap(str(tmp_path / "s.png")).convert(
+            mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, True
+        )
+    )
+    # splats of films have one sample a pixel, others four: outlines differ
+    limit = 2 if renderer == "mitsuba" else 10
     assert np.abs(frames[0].astype(int) - first).mean() < limit
     assert np.abs(frames[2].astype(int) - frames[0]).mean() > 1.5 * limit
     # The room is not symmetric, but its middle is: the brighter side of the back wall changes.
@@ -188,7 +251,14 @@ def test_film_of_a_moving_light(asset, tmp_path, renderer):
 def test_film_moves_the_lamp_of_an_area_light(asset, tmp_path):
     """An area light is a shape: it is seen where it is in each frame."""
     light = mi_prt.AreaLight((0, 0, 0.5), (0.3, 0, 0), (0, 0.3, 0), 50.0)
-    animate_local(asset, tmp_path / "f-%d.png", light_path("-0.5,0,0.5 0.5,0,0.5"), 2, light=light, scene=room())
+    animate_local(
+        asset,
+        tmp_path / "f-%d.png",
+        light_path("-0.5,0,0.5 0.5,0,0.5"),
+        2,
+        light=light,
+        scene=room(),
+    )
     frames = [image(tmp_path / f"f-{i}.png") for i in range(2)]
     places = [np.argmax(f[SIZE[1] // 2].sum(axis=-1)) for f in frames]
     assert places[0] < SIZE[0] / 2 < places[1]
@@ -213,8 +283,12 @@ def test_what_such_assets_do_not_take_is_refused(asset, tmp_path, arguments, err
 
 
 def test_distant_assets_refuse_components(tmp_path):
-    flat = {"type": "scene", "floor": wall(0, 0, 0, [1, 0, 0], -90, diffuse(0.5)), "sky": {"type": "constant"}}
-    distant = mi_prt.precompute.precompute(flat, directions="cubemap:4", coefficients=1)
+    flat = {
+        "type": "scene",
+        "floor": wall(0, 0, 0, [1, 0, 0], -90, diffuse(0.5)),
+        "sky": {"type": "constant"},
+    }
+    distant = mi_prt.precompute(flat, directions="cubemap:4", coefficients=1)
     with pytest.raises(SettingsError, match="points='samples'"):
         relight_to_file(distant, tmp_path / "a.npz", component="indirect", scene=flat)
     with pytest.raises(LightError, match="points='samples'"):
@@ -226,14 +300,23 @@ def test_films_without_a_light_to_move_are_refused(asset, tmp_path):
         animate_local(asset, tmp_path / "f.gif", light_path("0,0,0 1,0,0"), 2, scene=room())
 
 
-# --- the command line -----------------------------------------------------------------------------------------------
+# --- the command line -----------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
 def from_file(tmp_path_factory):
     """An asset of the scene of two rooms, made by the command line."""
     made = tmp_path_factory.mktemp("cli") / "room.prt"
-    options = ["--count", "1500", "--cluster-size", "150", "--depth-directions", "256", "--example-lights", "100"]
+    options = [
+        "--count",
+        "1500",
+        "--cluster-size",
+        "150",
+        "--depth-directions",
+        "256",
+        "--example-lights",
+        "100",
+    ]
     with pytest.raises(SystemExit) as end:
         main(["precompute", str(ROOM), "-o", str(made), "--points", "samples", *options, "--json"])
     assert end.value.code == 0
@@ -248,16 +331,56 @@ def run(capsys, *arguments):
 
 
 def test_command_line(from_file, tmp_path, capsys):
-    code, out, _ = run(capsys, "relight", from_file, "-o", tmp_path / "a.png", "--light", "point:0,1.5,1:2,2,2", "--component", "indirect", "--size", "64x40", "--json")
+    code, out, _ = run(
+        capsys,
+        "relight",
+        from_file,
+        "-o",
+        tmp_path / "a.png",
+        "--light",
+        "point:0,1.5,1:2,2,2",
+        "--component",
+        "indirect",
+        "--size",
+        "64x40",
+        "--json",
+    )
     assert code == 0 and json.loads(out)["points"] == 1500
-    film = ("--size", "64x40", "--light", "point:0,1.5,1:2", "--light-path", "-0.5,1.5,1 0.5,1.5,1", "--frames", "2", "--renderer", "raster", "--json")
+    film = (
+        "--size",
+        "64x40",
+        "--light",
+        "point:0,1.5,1:2",
+        "--light-path",
+        "-0.5,1.5,1 0.5,1.5,1",
+        "--frames",
+        "2",
+        "--renderer",
+        "raster",
+        "--json",
+    )
     code, out, _ = run(capsys, "relight", from_file, "-o", tmp_path / "a.gif", *film)
-    assert code == 0 and json.loads(out)["frames"] == 2 and (tmp_path / "a.gif").stat().st_size > 500
+    assert (
+        code == 0 and json.loads(out)["frames"] == 2 and (tmp_path / "a.gif").stat().st_size > 500
+    )
     code, out, _ = run(capsys, "info", from_file, "--json")
     told = json.loads(out)
     assert told["points"] == 1500 and told["storage"]["file"] == from_file.stat().st_size
     assert told["storage"]["depth"] + told["storage"]["transfer"] < told["storage"]["file"]
-    code, out, _ = run(capsys, "compare", from_file, "-o", tmp_path / "r", "--light", "point:0,1.5,1:2", "--size", "64x40", "--spp", "4", "--json")
+    code, out, _ = run(
+        capsys,
+        "compare",
+        from_file,
+        "-o",
+        tmp_path / "r",
+        "--light",
+        "point:0,1.5,1:2",
+        "--size",
+        "64x40",
+        "--spp",
+        "4",
+        "--json",
+    )
     assert code == 0 and json.loads(out)["components"]["indirect"]["bias"] < 1
 
 
@@ -273,7 +396,9 @@ def test_command_line(from_file, tmp_path, capsys):
     ],
 )
 def test_command_line_refuses(capsys, tmp_path, arguments, word):
-    code, _, error = run(capsys, "precompute", ROOM, "-o", tmp_path / "x.prt", "--points", "samples", *arguments)
+    code, _, error = run(
+        capsys, "precompute", ROOM, "-o", tmp_path / "x.prt", "--points", "samples", *arguments
+    )
     assert code == 2 and word in error and error.count("\n") <= 3
     assert not list(tmp_path.iterdir())
 

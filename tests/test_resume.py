@@ -1,4 +1,6 @@
-"""Interrupted runs: what was computed is kept, nothing half-written opens, and a continued run gives the same file."""
+"""Interrupted runs: what was computed is kept, nothing half-written opens, and a continued run
+gives the same file.
+"""
 
 import fcntl
 import json
@@ -10,32 +12,45 @@ import time
 
 import numpy as np
 import pytest
+from conftest import cube, diffuse, disk, rectangle, scene
 
 import mi_prt
 import mi_prt.system.runtime
-from conftest import cube, diffuse, disk, rectangle, scene
-from mi_prt.precompute import budget as room
 from mi_prt import AssetError, SettingsError
 from mi_prt.basis import pca
+from mi_prt.precompute import budget as room
+from mi_prt.precompute.workspace import RowFile, durable, temporary
 from mi_prt.system.memory import resident_bytes
 from mi_prt.system.runtime import mitsuba
 from mi_prt.system.runtime import thread_count as mitsuba_threads
 from mi_prt.transport.interreflection import MOST_SUMMED_BOUNCES
-from mi_prt.precompute.workspace import RowFile, durable, temporary
-
 
 
 def carpet(between=0.3):
-    """A floor of 40 x 40 cells of 0.1 m, of one colour but for a line through the middle of each cell, where no point is."""
+    """A floor of 40 x 40 cells of 0.1 m, of one colour but for a line through the middle of each
+    cell, where no point is.
+    """
     pixels = np.full((120, 120, 3), [0.8, 0.5, 0.3], np.float32)
     pixels[:, 1::3] = between
-    texture = {"type": "bitmap", "bitmap": mitsuba().Bitmap(pixels), "raw": True, "filter_type": "nearest"}
+    texture = {
+        "type": "bitmap",
+        "bitmap": mitsuba().Bitmap(pixels),
+        "raw": True,
+        "filter_type": "nearest",
+    }
     return rectangle(size=2, bsdf={"type": "diffuse", "reflectance": texture})
 
 
-SCENE = scene(floor=carpet(), box=cube((0.2, 0.4, 0), 0.4), ball=disk((0, -1, 0.1), (0.3, 1.5, 0), 0.6, bsdf=diffuse([0.2, 0.7, 0.4])))
+SCENE = scene(
+    floor=carpet(),
+    box=cube((0.2, 0.4, 0), 0.4),
+    ball=disk((0, -1, 0.1), (0.3, 1.5, 0), 0.6, bsdf=diffuse([0.2, 0.7, 0.4])),
+)
 SETTINGS = dict(directions="cubemap:16", edge_length=0.1, coefficients=24, bounces=0)
-REFLECTING = {name: SETTINGS | dict(bounces=2, indirect=name, paths_per_point=32) for name in ("solve", "paths")}
+REFLECTING = {
+    name: SETTINGS | dict(bounces=2, indirect=name, paths_per_point=32)
+    for name in ("solve", "paths")
+}
 RUNS = {"direct": SETTINGS} | REFLECTING
 LANES = 768 * 40  # blocks of 40 points: dozens of them
 
@@ -53,7 +68,7 @@ def files(tmp_path_factory):
     """The file of each run that nothing disturbed."""
     folder = tmp_path_factory.mktemp("whole")
     for name, settings in RUNS.items():
-        mi_prt.precompute.precompute(SCENE, output=folder / f"{name}.prt", **settings)
+        mi_prt.precompute(SCENE, output=folder / f"{name}.prt", **settings)
     return {name: folder / f"{name}.prt" for name in RUNS}
 
 
@@ -67,8 +82,10 @@ def test_the_runs_are_three(files):
     """Coloured reflections, and another result by each way to them."""
     assets = {name: mi_prt.load(path) for name, path in files.items()}
     assert {name: (asset.report["bounces"], asset.channels) for name, asset in assets.items()} == {
-        "direct": (0, 1), "solve": (2, 3), "paths": (2, 3)
-    }  # fmt: skip
+        "direct": (0, 1),
+        "solve": (2, 3),
+        "paths": (2, 3),
+    }
     assert len({path.read_bytes() for path in files.values()}) == 3
 
 
@@ -76,7 +93,7 @@ def partial(path):
     return path.with_name(path.name + ".partial")
 
 
-# --- SIGKILL -------------------------------------------------------------------------------------------------------
+# --- SIGKILL --------------------------------------------------------------------------------------
 
 PROGRAM = """
 import sys, time
@@ -90,23 +107,29 @@ room.LANES = LANES
 def progress(stage, done, total, detail):
     print(stage, done, total, flush=True)
     time.sleep(0.002)  # moments between the writes, in which a signal may arrive as well
-mi_prt.precompute.precompute(SCENE, output=sys.argv[2], resume=True, progress=progress, **RUNS[sys.argv[3]])
+mi_prt.precompute(SCENE, output=sys.argv[2], resume=True, progress=progress, **RUNS[sys.argv[3]])
 """
 
 
 def start(path, run):
     here = os.path.dirname(__file__)
     return subprocess.Popen(
-        [sys.executable, "-c", PROGRAM, here, str(path), run], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [sys.executable, "-c", PROGRAM, here, str(path), run],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
     )
 
 
-@pytest.mark.parametrize(("run", "chain"), [("direct", 0), ("solve", 1), ("solve", 2), ("paths", 3), ("paths", 4)])
+@pytest.mark.parametrize(
+    ("run", "chain"), [("direct", 0), ("solve", 1), ("solve", 2), ("paths", 3), ("paths", 4)]
+)
 def test_killed_runs_end_in_the_same_file(files, tmp_path, run, chain):
-    """Four SIGKILLs in a row at random moments, 20 in all five cases, the last two of each while reflections are computed, if there are
-    any; then the run is left alone.
+    """Four SIGKILLs in a row at random moments, 20 in all five cases, the last two of each while
+    reflections are computed, if there are any; then the run is left alone.
 
-    While it is unfinished no file of that name opens; every continuation starts at or beyond where the last one was.
+    While it is unfinished no file of that name opens; every continuation starts at or beyond where
+    the last one was.
     """
     undisturbed = files[run]
     rng, path, reached, killed = np.random.default_rng(chain), tmp_path / "asset.prt", {}, 0
@@ -114,17 +137,24 @@ def test_killed_runs_end_in_the_same_file(files, tmp_path, run, chain):
         process = start(path, run)
         lines = [process.stdout.readline()]
         assert lines[0], process.communicate()[1][-2000:]
-        while run != "direct" and killed >= 2 and lines[-1] and not lines[-1].startswith("indirect"):
+        while (
+            run != "direct" and killed >= 2 and lines[-1] and not lines[-1].startswith("indirect")
+        ):
             lines.append(process.stdout.readline())
         time.sleep(rng.uniform(0, 0.4))
         process.send_signal(signal.SIGKILL)
         output, _ = process.communicate(timeout=60)
         killed += process.returncode == -signal.SIGKILL
         for stage in ("transport", "indirect"):
-            done = [int(line.split()[1]) for line in [*lines, *output.splitlines()] if line.startswith(stage) and line.count(" ") == 2]
+            done = [
+                int(line.split()[1])
+                for line in [*lines, *output.splitlines()]
+                if line.startswith(stage) and line.count(" ") == 2
+            ]
             assert not done or done[0] >= reached.get(stage, 0)
             reached[stage] = max([reached.get(stage, 0), *done])
-        if path.exists():  # it has to be whole, whether the process was killed after it or came to its end; then anew
+        # it has to be whole, whether the process was killed after it or came to its end; then anew
+        if path.exists():
             assert path.read_bytes() == undisturbed.read_bytes()
             path.unlink()
             reached = reached if (partial(path) / "run.json").exists() else {}
@@ -137,11 +167,21 @@ def test_killed_runs_end_in_the_same_file(files, tmp_path, run, chain):
 
 @pytest.mark.parametrize(
     ("run", "stage"),
-    [("direct", "transport"), ("direct", "basis"), ("direct", "coefficients"), ("solve", "coefficients"), ("solve", "indirect"),
-     ("solve", "reflections"), ("paths", "basis"), ("paths", "indirect")],
-)  # fmt: skip
+    [
+        ("direct", "transport"),
+        ("direct", "basis"),
+        ("direct", "coefficients"),
+        ("solve", "coefficients"),
+        ("solve", "indirect"),
+        ("solve", "reflections"),
+        ("paths", "basis"),
+        ("paths", "indirect"),
+    ],
+)
 def test_interrupts_keep_what_was_computed(files, tmp_path, monkeypatch, run, stage):
-    """Ctrl-C in the middle of each stage: no file, the rows of before are there, and continuing, with other blocks, gives the same file."""
+    """Ctrl-C in the middle of each stage: no file, the rows of before are there, and continuing,
+    with other blocks, gives the same file.
+    """
     path, seen = tmp_path / "asset.prt", []
 
     def interrupt(at, done, total, detail):
@@ -153,16 +193,16 @@ def test_interrupts_keep_what_was_computed(files, tmp_path, monkeypatch, run, st
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(room, "LANES", LANES)
-        mi_prt.precompute.precompute(SCENE, output=path, progress=interrupt, **RUNS[run])
+        mi_prt.precompute(SCENE, output=path, progress=interrupt, **RUNS[run])
     assert not path.exists() and partial(path).is_dir()
-    mi_prt.precompute.precompute(SCENE, output=path, progress=watch, resume=True, **RUNS[run])
+    mi_prt.precompute(SCENE, output=path, progress=watch, resume=True, **RUNS[run])
     assert seen[0][0] == "transport" and seen[0][1] > 10 * 40
     if stage in ("indirect", "reflections"):
         assert dict(reversed(seen))["indirect"] > 1000  # the first event of the stage
     assert path.read_bytes() == files[run].read_bytes() and not partial(path).exists()
 
 
-# --- what may not be continued -------------------------------------------------------------------------------------
+# --- what may not be continued --------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -175,7 +215,7 @@ def unfinished(tmp_path):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        mi_prt.precompute.precompute(SCENE, output=path, progress=interrupt, **SETTINGS)
+        mi_prt.precompute(SCENE, output=path, progress=interrupt, **SETTINGS)
     return path
 
 
@@ -190,23 +230,36 @@ OTHER_SCENES = {
 @pytest.mark.parametrize("other", OTHER_SCENES)
 def test_another_scene_is_refused(unfinished, other):
     with pytest.raises(SettingsError, match="scene was") as caught:
-        mi_prt.precompute.precompute(OTHER_SCENES[other], output=unfinished, resume=True, **SETTINGS)
+        mi_prt.precompute(OTHER_SCENES[other], output=unfinished, resume=True, **SETTINGS)
     assert "\n" not in str(caught.value) and "delete the folder" in str(caught.value)
 
 
 @pytest.mark.parametrize(
     "change",
-    [dict(directions="cubemap:8"), dict(coefficients=25), dict(seed=1), dict(rays_per_direction=2), dict(basis="haar"), dict(edge_length=0.2),
-     dict(coefficients="auto", variance=0.9), dict(bounces=1), dict(bounces="auto"), dict(indirect="paths"), dict(paths_per_point=64),
-     dict(denoise=False)],
+    [
+        dict(directions="cubemap:8"),
+        dict(coefficients=25),
+        dict(seed=1),
+        dict(rays_per_direction=2),
+        dict(basis="haar"),
+        dict(edge_length=0.2),
+        dict(coefficients="auto", variance=0.9),
+        dict(bounces=1),
+        dict(bounces="auto"),
+        dict(indirect="paths"),
+        dict(paths_per_point=64),
+        dict(denoise=False),
+    ],
     ids=str,
-)  # fmt: skip
+)
 def test_other_settings_are_refused(unfinished, change):
     """Each by its name, with both values; what was computed stays and can still be continued."""
     with pytest.raises(SettingsError) as caught:
-        mi_prt.precompute.precompute(SCENE, output=unfinished, resume=True, **SETTINGS | change)
+        mi_prt.precompute(SCENE, output=unfinished, resume=True, **SETTINGS | change)
     for key, value in change.items():
-        assert f"{key} was {SETTINGS.get(key, '')}" in str(caught.value) and f"now {value}" in str(caught.value)
+        assert f"{key} was {SETTINGS.get(key, '')}" in str(caught.value) and f"now {value}" in str(
+            caught.value
+        )
     assert (partial(unfinished) / "visibility.rows").stat().st_size > 0
 
 
@@ -215,31 +268,38 @@ def test_another_version_is_refused(unfinished):
     recorded["versions"]["mitsuba"] = "1.0"
     (partial(unfinished) / "run.json").write_text(json.dumps(recorded))
     with pytest.raises(SettingsError, match="versions was"):
-        mi_prt.precompute.precompute(SCENE, output=unfinished, resume=True, **SETTINGS)
+        mi_prt.precompute(SCENE, output=unfinished, resume=True, **SETTINGS)
 
 
 def test_an_unfinished_run_is_not_overwritten(unfinished):
     """Without `resume` it could only be lost."""
     with pytest.raises(SettingsError, match="--resume"):
-        mi_prt.precompute.precompute(SCENE, output=unfinished, **SETTINGS)
+        mi_prt.precompute(SCENE, output=unfinished, **SETTINGS)
 
 
 def test_resume_without_anything_to_continue_starts(undisturbed, tmp_path):
     """So that a script can always pass it."""
-    mi_prt.precompute.precompute(SCENE, output=tmp_path / "a.prt", resume=True, **SETTINGS)
+    mi_prt.precompute(SCENE, output=tmp_path / "a.prt", resume=True, **SETTINGS)
     assert (tmp_path / "a.prt").read_bytes() == undisturbed.read_bytes()
 
 
 def test_too_many_coefficients_cost_no_rays(tmp_path):
-    """The rank is known only after the fit: then another number may be asked for, and the rays are not traced again."""
+    """The rank is known only after the fit: then another number may be asked for, and the rays are
+    not traced again.
+    """
     flat = scene(box=cube())  # six normals and no shadow
     settings = dict(directions="cubemap:8", edge_length=0.4)
     path, seen = tmp_path / "a.prt", []
     with pytest.raises(SettingsError, match="at most") as caught:
-        mi_prt.precompute.precompute(flat, output=path, coefficients=60, **settings)
+        mi_prt.precompute(flat, output=path, coefficients=60, **settings)
     rank = int(str(caught.value).split("at most ")[1].split()[0])
-    asset = mi_prt.precompute.precompute(
-        flat, output=path, coefficients=rank, resume=True, progress=lambda *event: seen.append(event), **settings
+    asset = mi_prt.precompute(
+        flat,
+        output=path,
+        coefficients=rank,
+        resume=True,
+        progress=lambda *event: seen.append(event),
+        **settings,
     )
     assert len(asset.basis) == rank == 5 and seen[0][:3] == ("transport", seen[0][2], seen[0][2])
 
@@ -253,7 +313,9 @@ def test_a_workspace_belongs_to_one_process(tmp_path):
 
 
 def test_what_stands_in_the_way(tmp_path):
-    """A file where the folder should be; a folder that was left before anything was recorded is no run."""
+    """A file where the folder should be; a folder that was left before anything was recorded is no
+    run.
+    """
     (tmp_path / "a.prt.partial").write_text("")
     with pytest.raises(SettingsError, match="a.prt.partial"):
         with durable(tmp_path / "a.prt", {}, False):
@@ -266,13 +328,15 @@ def test_what_stands_in_the_way(tmp_path):
 
 @pytest.mark.parametrize("content", ["", "3", "[1]", "{no json", "null"])
 def test_a_damaged_record_is_refused_and_nothing_deleted(unfinished, content):
-    """What rows belong to cannot be told any more; without versions or scene it could be any run's."""
+    """What rows belong to cannot be told any more; without versions or scene it could be any
+    run's.
+    """
     (partial(unfinished) / "run.json").write_text(content)
     with pytest.raises(SettingsError, match="damaged"):
-        mi_prt.precompute.precompute(SCENE, output=unfinished, resume=True, **SETTINGS)
+        mi_prt.precompute(SCENE, output=unfinished, resume=True, **SETTINGS)
     (partial(unfinished) / "run.json").write_text("{}")
     with pytest.raises(SettingsError, match="scene was not recorded"):
-        mi_prt.precompute.precompute(SCENE, output=unfinished, resume=True, **SETTINGS)
+        mi_prt.precompute(SCENE, output=unfinished, resume=True, **SETTINGS)
     assert (partial(unfinished) / "visibility.rows").stat().st_size > 0
 
 
@@ -282,7 +346,7 @@ def test_files_that_are_not_ours_are_left_alone(tmp_path, foreign):
     folder.mkdir()
     (folder / foreign).mkdir() if foreign == "folder" else (folder / foreign).write_text("precious")
     with pytest.raises(SettingsError, match=foreign):
-        mi_prt.precompute.precompute(SCENE, output=tmp_path / "a.prt", **SETTINGS)
+        mi_prt.precompute(SCENE, output=tmp_path / "a.prt", **SETTINGS)
     assert os.listdir(folder) == [foreign]
 
 
@@ -290,11 +354,13 @@ def test_a_link_in_the_place_of_the_folder_is_refused(tmp_path):
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "a.prt.partial").symlink_to(tmp_path / "elsewhere")
     with pytest.raises(SettingsError, match="link"):
-        mi_prt.precompute.precompute(SCENE, output=tmp_path / "a.prt", **SETTINGS)
+        mi_prt.precompute(SCENE, output=tmp_path / "a.prt", **SETTINGS)
 
 
 def test_a_folder_that_was_replaced_while_it_was_locked(tmp_path, monkeypatch):
-    """The first lock is on a folder that another process removes and makes again: it is noticed, and the new one is locked."""
+    """The first lock is on a folder that another process removes and makes again: it is noticed,
+    and the new one is locked.
+    """
     flock, calls = fcntl.flock, []
 
     def replaced(handle, operation):
@@ -317,85 +383,117 @@ def test_the_scene_is_not_overwritten(tmp_path):
     path = tmp_path / "scene.xml"
     path.write_text("<scene version='3.0.0'><shape type='sphere'/></scene>")
     with pytest.raises(SettingsError, match="the scene itself"):
-        mi_prt.precompute.precompute(path, output=path)
+        mi_prt.precompute(path, output=path)
     assert "sphere" in path.read_text() and os.listdir(tmp_path) == ["scene.xml"]
 
 
 def test_a_link_to_the_output_stays_a_link(undisturbed, tmp_path):
     (tmp_path / "data").mkdir()
     (tmp_path / "a.prt").symlink_to(tmp_path / "data" / "a.prt")
-    mi_prt.precompute.precompute(SCENE, output=tmp_path / "a.prt", **SETTINGS)
-    assert (tmp_path / "a.prt").is_symlink() and (tmp_path / "data" / "a.prt").read_bytes() == undisturbed.read_bytes()
+    mi_prt.precompute(SCENE, output=tmp_path / "a.prt", **SETTINGS)
+    assert (tmp_path / "a.prt").is_symlink() and (
+        tmp_path / "data" / "a.prt"
+    ).read_bytes() == undisturbed.read_bytes()
 
 
 def test_resume_needs_an_output():
     with pytest.raises(SettingsError, match="output"):
-        mi_prt.precompute.precompute(SCENE, resume=True, **SETTINGS)
+        mi_prt.precompute(SCENE, resume=True, **SETTINGS)
 
 
 def test_numbers_of_other_types_are_the_same_settings(unfinished, undisturbed):
     """The command line passes text, programs NumPy's numbers."""
-    settings = dict(directions="cubemap:16", edge_length="0.10", coefficients=np.int64(24), seed=np.int32(0))
+    settings = dict(
+        directions="cubemap:16", edge_length="0.10", coefficients=np.int64(24), seed=np.int32(0)
+    )
     settings |= dict(rays_per_direction=np.int16(1), bounces=np.uint8(0))
-    mi_prt.precompute.precompute(SCENE, output=unfinished, resume=True, **settings)
+    mi_prt.precompute(SCENE, output=unfinished, resume=True, **settings)
     assert unfinished.read_bytes() == undisturbed.read_bytes()
 
 
 @pytest.mark.parametrize("threads", [1, 3])
 @pytest.mark.parametrize(
-    ("run", "negligible"), [("direct", 0), ("direct", 1e9), ("solve", 0), ("paths", 0)], ids=["iterated", "exact", "solve", "paths"]
+    ("run", "negligible"),
+    [("direct", 0), ("direct", 1e9), ("solve", 0), ("paths", 0)],
+    ids=["iterated", "exact", "solve", "paths"],
 )
-def test_results_do_not_depend_on_threads_and_memory(files, tmp_path, monkeypatch, threads, run, negligible):
+def test_results_do_not_depend_on_threads_and_memory(
+    files, tmp_path, monkeypatch, threads, run, negligible
+):
     """The way of the fit is chosen by shape alone, and sums are taken in an order that is fixed."""
     expected = files[run]
     if negligible:
         monkeypatch.setattr(pca, "NEGLIGIBLE", negligible)
-        mi_prt.precompute.precompute(SCENE, output=tmp_path / "a.prt", **RUNS[run])
+        mi_prt.precompute(SCENE, output=tmp_path / "a.prt", **RUNS[run])
         expected = tmp_path / "a.prt"
     before = mitsuba_threads()
     mi_prt.system.runtime.set_threads(threads)
     try:
         limit = resident_bytes() + 200_000_000
-        mi_prt.precompute.precompute(SCENE, output=tmp_path / "b.prt", max_memory=limit, **RUNS[run])
+        mi_prt.precompute(SCENE, output=tmp_path / "b.prt", max_memory=limit, **RUNS[run])
     finally:
         mi_prt.system.runtime.set_threads(before)
     assert expected.read_bytes() == (tmp_path / "b.prt").read_bytes()
 
 
 @pytest.mark.parametrize("bounces", [40, "auto"])
-def test_reflections_that_are_solved_for_do_not_depend_on_threads_and_blocks(tmp_path, monkeypatch, bounces):
+def test_reflections_that_are_solved_for_do_not_depend_on_threads_and_blocks(
+    tmp_path, monkeypatch, bounces
+):
     """Between white walls, where a series is long and `auto` leaves it to a Krylov method."""
-    walls = {name: rectangle(normal, -np.array(normal), 1, bsdf=diffuse([0.95, 0.9, 0.9])) for name, normal in
-             {"floor": (0, 1, 0), "left": (1, 0, 0), "right": (-1, 0, 0), "back": (0, 0, 1), "roof": (0, -1, 0)}.items()}  # fmt: skip
+    walls = {
+        name: rectangle(normal, -np.array(normal), 1, bsdf=diffuse([0.95, 0.9, 0.9]))
+        for name, normal in {
+            "floor": (0, 1, 0),
+            "left": (1, 0, 0),
+            "right": (-1, 0, 0),
+            "back": (0, 0, 1),
+            "roof": (0, -1, 0),
+        }.items()
+    }
     settings = dict(directions="cubemap:8", edge_length=0.3, bounces=bounces, paths_per_point=32)
-    mi_prt.precompute.precompute(scene(**walls), output=tmp_path / "a.prt", **settings)
+    mi_prt.precompute(scene(**walls), output=tmp_path / "a.prt", **settings)
     assert mi_prt.load(tmp_path / "a.prt").report["bounces"] > MOST_SUMMED_BOUNCES
     monkeypatch.setattr(room, "LANES", LANES)
     before = mitsuba_threads()
     mi_prt.system.runtime.set_threads(3)
     try:
-        mi_prt.precompute.precompute(scene(**walls), output=tmp_path / "b.prt", **settings)
+        mi_prt.precompute(scene(**walls), output=tmp_path / "b.prt", **settings)
     finally:
         mi_prt.system.runtime.set_threads(before)
     assert (tmp_path / "a.prt").read_bytes() == (tmp_path / "b.prt").read_bytes()
 
 
 def test_a_share_that_is_out_of_reach_costs_no_rays(tmp_path):
-    """Harmonics do not get there: another share may be asked for, and the rays are not traced again."""
-    settings = dict(directions="cubemap:8", edge_length=0.3, basis="sh", coefficients="auto", bounces=0)
+    """Harmonics do not get there: another share may be asked for, and the rays are not traced
+    again.
+    """
+    settings = dict(
+        directions="cubemap:8", edge_length=0.3, basis="sh", coefficients="auto", bounces=0
+    )
     path, seen = tmp_path / "a.prt", []
     with pytest.raises(SettingsError, match="resume"):
-        mi_prt.precompute.precompute(SCENE, output=path, variance=0.99999, **settings)
-    mi_prt.precompute.precompute(SCENE, output=path, variance=0.8, resume=True, progress=lambda *event: seen.append(event), **settings)
+        mi_prt.precompute(SCENE, output=path, variance=0.99999, **settings)
+    mi_prt.precompute(
+        SCENE,
+        output=path,
+        variance=0.8,
+        resume=True,
+        progress=lambda *event: seen.append(event),
+        **settings,
+    )
     assert seen[0][:3] == ("transport", seen[0][2], seen[0][2])
 
 
 def test_passes_of_a_fit_that_failed_do_not_reach_another(tmp_path, monkeypatch):
-    """A search for a share of the variance starts its later fits from earlier ones. When it fails and so many components are
-    asked for outright, that fit is the one of an undisturbed run."""
+    """A search for a share of the variance starts its later fits from earlier ones. When it fails
+    and so many components are asked for outright, that fit is the one of an undisturbed run.
+    """
     module, tried = sys.modules["mi_prt.precompute.precompute"], []
     leading = pca._leading
-    monkeypatch.setattr(pca, "_leading", lambda *arguments: tried.append(arguments[2]) or leading(*arguments))
+    monkeypatch.setattr(
+        pca, "_leading", lambda *arguments: tried.append(arguments[2]) or leading(*arguments)
+    )
     auto = SETTINGS | dict(coefficients="auto", variance=0.993)
 
     def refuse(*_):
@@ -404,21 +502,33 @@ def test_passes_of_a_fit_that_failed_do_not_reach_another(tmp_path, monkeypatch)
     with monkeypatch.context() as patch:
         patch.setattr(module, "check_room", refuse)
         with pytest.raises(SettingsError, match="no room"):
-            mi_prt.precompute.precompute(SCENE, output=tmp_path / "a.prt", **auto)
+            mi_prt.precompute(SCENE, output=tmp_path / "a.prt", **auto)
     assert len(tried) > 1
     outright = SETTINGS | dict(coefficients=tried[1])
-    mi_prt.precompute.precompute(SCENE, output=tmp_path / "a.prt", resume=True, **outright)
-    mi_prt.precompute.precompute(SCENE, output=tmp_path / "b.prt", **outright)
+    mi_prt.precompute(SCENE, output=tmp_path / "a.prt", resume=True, **outright)
+    mi_prt.precompute(SCENE, output=tmp_path / "b.prt", **outright)
     assert (tmp_path / "a.prt").read_bytes() == (tmp_path / "b.prt").read_bytes()
 
 
 def test_paths_kept_in_a_span_that_was_given_up_do_not_reach_another(tmp_path, monkeypatch):
-    """Reflections make a second fit necessary, to more of direct transport; there is no room for it. As many coefficients as the first
-    fit had, asked for outright, have another span by a little: the paths of an undisturbed run are told in that one."""
+    """Reflections make a second fit necessary, to more of direct transport; there is no room for
+    it. As many coefficients as the first fit had, asked for outright, have another span by a
+    little: the paths of an undisturbed run are told in that one.
+    """
     module, fits = sys.modules["mi_prt.precompute.precompute"], []
-    walls = {name: rectangle(normal, -np.array(normal), 1) for name, normal in dict(a=(0, 1, 0), b=(1, 0, 0), c=(0, 0, 1)).items()}
-    corner = scene(**{name: wall | {"bsdf": diffuse(0.9)} for name, wall in (walls | dict(box=cube((-0.2, -0.6, -0.2), 0.4))).items()})
-    settings = dict(directions="cubemap:8", edge_length=0.2, bounces=1, indirect="paths", paths_per_point=256)
+    walls = {
+        name: rectangle(normal, -np.array(normal), 1)
+        for name, normal in dict(a=(0, 1, 0), b=(1, 0, 0), c=(0, 0, 1)).items()
+    }
+    corner = scene(
+        **{
+            name: wall | {"bsdf": diffuse(0.9)}
+            for name, wall in (walls | dict(box=cube((-0.2, -0.6, -0.2), 0.4))).items()
+        }
+    )
+    settings = dict(
+        directions="cubemap:8", edge_length=0.2, bounces=1, indirect="paths", paths_per_point=256
+    )
 
     def refuse(what, *_):
         fits.append(int(what.split()[1]))
@@ -428,10 +538,14 @@ def test_paths_kept_in_a_span_that_was_given_up_do_not_reach_another(tmp_path, m
     with monkeypatch.context() as patch:
         patch.setattr(module, "check_room", refuse)
         with pytest.raises(SettingsError, match="no room"):
-            mi_prt.precompute.precompute(corner, output=tmp_path / "a.prt", coefficients="auto", variance=0.97, **settings)
+            mi_prt.precompute(
+                corner, output=tmp_path / "a.prt", coefficients="auto", variance=0.97, **settings
+            )
     assert 40 < fits[0] < fits[1] and list(partial(tmp_path / "a.prt").glob("paths-*.rows"))
-    mi_prt.precompute.precompute(corner, output=tmp_path / "a.prt", coefficients=fits[0], resume=True, **settings)
-    mi_prt.precompute.precompute(corner, output=tmp_path / "b.prt", coefficients=fits[0], **settings)
+    mi_prt.precompute(
+        corner, output=tmp_path / "a.prt", coefficients=fits[0], resume=True, **settings
+    )
+    mi_prt.precompute(corner, output=tmp_path / "b.prt", coefficients=fits[0], **settings)
     assert (tmp_path / "a.prt").read_bytes() == (tmp_path / "b.prt").read_bytes()
 
 
@@ -441,7 +555,7 @@ def test_an_unfinished_run_is_no_asset(unfinished):
             mi_prt.load(path)
 
 
-# --- rows on disk --------------------------------------------------------------------------------------------------
+# --- rows on disk ---------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -459,13 +573,22 @@ def test_rows_are_read_by_slice_and_by_index(rows):
     path, matrix = rows
     file = RowFile(path, 10, 5)
     assert file.filled == 10 and file.shape == matrix.shape
-    for index in [slice(None), slice(3, 7), slice(8, 20), np.array([0, 3, 9]), np.array([5]), np.array([], int)]:
+    for index in [
+        slice(None),
+        slice(3, 7),
+        slice(8, 20),
+        np.array([0, 3, 9]),
+        np.array([5]),
+        np.array([], int),
+    ]:
         np.testing.assert_array_equal(file[index], matrix[index])
 
 
 @pytest.mark.parametrize("cut", range(0, 51, 7))
 def test_a_torn_end_is_dropped(rows, cut):
-    """The data end anywhere, as after a power failure: whole blocks stay, and appending goes on behind them."""
+    """The data end anywhere, as after a power failure: whole blocks stay, and appending goes on
+    behind them.
+    """
     path, matrix = rows
     path.write_bytes(path.read_bytes()[:cut])
     file = RowFile(path, 10, 5)
@@ -497,7 +620,14 @@ def test_arrays_are_kept_whole_or_not_at_all():
         assert workspace.keep("a", lambda: np.arange(3.0)).sum() == 3
         assert workspace.keep("a", lambda: np.zeros(3)).sum() == 3
         whole = path.read_bytes()
-        for damaged in [b"", b"torn", whole[:-5], whole[:130] + bytes([whole[130] ^ 1]) + whole[131:], b"PK" + whole[2:], whole * 2]:
+        for damaged in [
+            b"",
+            b"torn",
+            whole[:-5],
+            whole[:130] + bytes([whole[130] ^ 1]) + whole[131:],
+            b"PK" + whole[2:],
+            whole * 2,
+        ]:
             path.write_bytes(damaged)
             assert workspace.keep("a", lambda: np.full(3, 5.0)).sum() == 15
         assert [p.name for p in workspace.folder.iterdir()] == ["a.array"]
@@ -515,23 +645,25 @@ def test_reads_beyond_what_the_system_gives_at_once(rows, monkeypatch):
     np.testing.assert_array_equal(file[:], matrix)
 
 
-# --- memory --------------------------------------------------------------------------------------------------------
+# --- memory ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("bad", ["0", "-1G", "many", "3 apples", "nan", 0, True, "inf", ""])
 def test_bad_memory(bad):
     with pytest.raises(SettingsError, match="memory"):
-        mi_prt.precompute.precompute(SCENE, max_memory=bad, **SETTINGS)
+        mi_prt.precompute(SCENE, max_memory=bad, **SETTINGS)
 
 
 def test_too_little_memory_says_how_much_is_needed():
     with pytest.raises(SettingsError, match="raise max_memory"):
-        mi_prt.precompute.precompute(SCENE, max_memory="10M", **SETTINGS)
+        mi_prt.precompute(SCENE, max_memory="10M", **SETTINGS)
 
 
 @pytest.mark.parametrize("run", RUNS)
 def test_a_run_stays_within_its_memory_and_gives_the_same_file(files, tmp_path, run):
-    """The peak of a fresh process, by the kernel's own count, with a limit that a whole wavefront does not fit into."""
+    """The peak of a fresh process, by the kernel's own count, with a limit that a whole wavefront
+    does not fit into.
+    """
     code = """
 import sys; sys.path.insert(0, sys.argv[1])
 import mi_prt
@@ -542,17 +674,20 @@ from mi_prt.scene.scene import open_scene
 from test_resume import RUNS, SCENE
 pca.NEGLIGIBLE = 0
 settings = RUNS[sys.argv[3]]
-mi_prt.precompute.precompute(SCENE, **settings | dict(directions="cubemap:2", edge_length=1, coefficients=4))  # what Mitsuba and Embree take once
+mi_prt.precompute(SCENE, **settings | dict(directions="cubemap:2", edge_length=1, coefficients=4))  # what Mitsuba and Embree take once
 limit = resident_bytes() + 60_000_000
 def blocks(**options):
     stages = []
-    mi_prt.precompute.precompute(SCENE, progress=lambda stage, *_: stages.append(stage), **options, **settings)
+    mi_prt.precompute(SCENE, progress=lambda stage, *_: stages.append(stage), **options, **settings)
     return stages.count("transport")
 limited = blocks(output=sys.argv[2], max_memory=limit)
 print(limit, peak_memory_bytes(), limited, blocks())
 """
     ran = subprocess.run(
-        [sys.executable, "-c", code, os.path.dirname(__file__), str(tmp_path / "a.prt"), run], capture_output=True, text=True, timeout=120
+        [sys.executable, "-c", code, os.path.dirname(__file__), str(tmp_path / "a.prt"), run],
+        capture_output=True,
+        text=True,
+        timeout=120,
     )
     assert ran.returncode == 0, ran.stderr[-2000:]
     limit, peak, limited, blocks = map(int, ran.stdout.split())

@@ -1,6 +1,8 @@
-"""The machine layer: an unusable LLVM gives a typed error and never an abort, kernels are counted, doctor survives.
+"""The machine layer: an unusable LLVM gives a typed error and never an abort, kernels are counted,
+doctor survives.
 
-Whatever depends on what Dr.Jit loads runs in a process of its own, because Dr.Jit chooses its LLVM once per process.
+Whatever depends on what Dr.Jit loads runs in a process of its own, because Dr.Jit chooses its LLVM
+once per process.
 """
 
 import json
@@ -11,24 +13,28 @@ import time
 
 import pytest
 
-from mi_prt.system import doctor
-from mi_prt.system import llvm
-from mi_prt.system import runtime
 from mi_prt.errors import RuntimeSetupError, SettingsError
+from mi_prt.system import doctor, llvm, runtime
 
 linux_only = pytest.mark.skipif(sys.platform != "linux", reason="the linker and /proc are Linux's")
 
 
 def run_python(code: str, **variables: str) -> subprocess.CompletedProcess:
-    """Run code in a new process without a GPU; variables replace those of this process, an empty one is removed."""
+    """Run code in a new process without a GPU; variables replace those of this process, an empty
+    one is removed.
+    """
     env = os.environ | {"CUDA_VISIBLE_DEVICES": "", llvm.VARIABLE: ""} | variables
     env = {name: value for name, value in env.items() if value or name == "CUDA_VISIBLE_DEVICES"}
-    return subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, timeout=120)
+    return subprocess.run(
+        [sys.executable, "-c", code], env=env, capture_output=True, text=True, timeout=120
+    )
 
 
 @pytest.fixture
 def fake_library(tmp_path):
-    """Makes a file with a library's name and this machine's executable header, which is all that a search reads."""
+    """Makes a file with a library's name and this machine's executable header, which is all that a
+    search reads.
+    """
     with open(sys.executable, "rb") as file:
         header = file.read(64)
 
@@ -41,11 +47,21 @@ def fake_library(tmp_path):
     return make
 
 
-@pytest.mark.parametrize(("path", "version"), [
-    ("libLLVM-14.so.1", 14), ("libLLVM-14.0.6.so", 14), ("libLLVM.so.19.1", 19), ("libLLVM-19.so", 19),
-    ("libLLVM.22.dylib", 22), ("llvm-17/lib/libLLVM.so", 17), ("llvm-19/lib/libLLVM.so.1", 19),
-    ("opt/llvm@18/lib/libLLVM.dylib", 18), ("Cellar/llvm/20.1.7/lib/libLLVM.dylib", 20), ("lib/libLLVM.so", None),
-])
+@pytest.mark.parametrize(
+    ("path", "version"),
+    [
+        ("libLLVM-14.so.1", 14),
+        ("libLLVM-14.0.6.so", 14),
+        ("libLLVM.so.19.1", 19),
+        ("libLLVM-19.so", 19),
+        ("libLLVM.22.dylib", 22),
+        ("llvm-17/lib/libLLVM.so", 17),
+        ("llvm-19/lib/libLLVM.so.1", 19),
+        ("opt/llvm@18/lib/libLLVM.dylib", 18),
+        ("Cellar/llvm/20.1.7/lib/libLLVM.dylib", 20),
+        ("lib/libLLVM.so", None),
+    ],
+)
 def test_version_is_told_from_the_name_or_folder(fake_library, path, version):
     assert llvm.library_version(fake_library(path)) == version
 
@@ -56,9 +72,19 @@ def test_version_is_told_from_the_target_of_a_link(fake_library, tmp_path):
 
 
 def test_search_ranks_tried_versions_first(fake_library, tmp_path):
-    """17 to 22 were tried, 23 was not; one without a version comes before one that is surely too old."""
-    for name in ("libLLVM-14.so.1", "libLLVM.so.19.1", "libLLVM-22.so", "libLLVM-17.so", "libLLVM.so.23.0",
-                 "libLLVM.so", "libLLVMCore.so.19", "libLLVM-19.so.txt"):
+    """17 to 22 were tried, 23 was not; one without a version comes before one that is surely too
+    old.
+    """
+    for name in (
+        "libLLVM-14.so.1",
+        "libLLVM.so.19.1",
+        "libLLVM-22.so",
+        "libLLVM-17.so",
+        "libLLVM.so.23.0",
+        "libLLVM.so",
+        "libLLVMCore.so.19",
+        "libLLVM-19.so.txt",
+    ):
         fake_library(name)
     (tmp_path / "libLLVM-19.so").symlink_to("libLLVM.so.19.1")
     found = llvm.find_libraries([str(tmp_path)])
@@ -90,39 +116,55 @@ def test_search_is_fast_enough_for_each_import():
 def test_importing_mi_prt_selects_unless_the_user_has(fake_library, tmp_path, chosen):
     fake_library("libLLVM-14.so")
     best = fake_library("libLLVM-22.so")
-    run = run_python("import os, mi_prt; print(os.environ['DRJIT_LIBLLVM_PATH'])",
-                     LD_LIBRARY_PATH=str(tmp_path), DRJIT_LIBLLVM_PATH=chosen)
+    run = run_python(
+        "import os, mi_prt; print(os.environ['DRJIT_LIBLLVM_PATH'])",
+        LD_LIBRARY_PATH=str(tmp_path),
+        DRJIT_LIBLLVM_PATH=chosen,
+    )
     assert run.stdout.strip() == (chosen or best), run.stderr
 
 
-@pytest.mark.parametrize(("name", "content", "said"), [
-    ("libLLVM-14.so", b"", "LLVM 14, but 17 or newer is needed"),
-    ("libLLVM-16.so.1", b"", "LLVM 16, but 17 or newer is needed"),
-    ("libLLVM-19.so", b"damaged", "could not load"),
-    ("libLLVM-19.so", None, "no such file"),
-])
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("libLLVM-14.so", b"", "LLVM 14, but 17 or newer is needed"),
+        ("libLLVM-16.so.1", b"", "LLVM 16, but 17 or newer is needed"),
+        ("libLLVM-19.so", b"damaged", "could not load"),
+        ("libLLVM-19.so", None, "no such file"),
+    ],
+)
 def test_unusable_llvm_gives_a_typed_error_in_one_line(fake_library, tmp_path, name, content, said):
     path = fake_library(name, content) if content is not None else str(tmp_path / name)
-    run = run_python("from mi_prt.system.runtime import mitsuba; mitsuba()", DRJIT_LIBLLVM_PATH=path)
+    run = run_python(
+        "from mi_prt.system.runtime import mitsuba; mitsuba()", DRJIT_LIBLLVM_PATH=path
+    )
     assert run.returncode == 1  # an abort would be negative
     message = run.stderr.splitlines()[-1]
     assert message.startswith("mi_prt.errors.RuntimeSetupError: ")
-    assert path in message and said in message and "; " in message  # the offender, the limit, the remedy
+    # the offender, the limit, the remedy
+    assert path in message and said in message and "; " in message
 
 
 def test_drjit_imported_first_without_a_usable_llvm_is_told_apart(fake_library, tmp_path):
     usable = fake_library("libLLVM-22.so")
-    code = ("import os, drjit; del os.environ['DRJIT_LIBLLVM_PATH']\n"
-            "from mi_prt.system.runtime import mitsuba; mitsuba()")
-    run = run_python(code, DRJIT_LIBLLVM_PATH=str(tmp_path / "none.so"), LD_LIBRARY_PATH=str(tmp_path))
+    code = (
+        "import os, drjit; del os.environ['DRJIT_LIBLLVM_PATH']\n"
+        "from mi_prt.system.runtime import mitsuba; mitsuba()"
+    )
+    run = run_python(
+        code, DRJIT_LIBLLVM_PATH=str(tmp_path / "none.so"), LD_LIBRARY_PATH=str(tmp_path)
+    )
     message = run.stderr.splitlines()[-1]
     assert run.returncode == 1 and message.startswith("mi_prt.errors.RuntimeSetupError: ")
     assert "imported before mi_prt" in message and usable in message
 
 
 def test_another_variant_is_refused_by_name():
-    run = run_python("from mi_prt.system.runtime import mitsuba\n"
-                     "import mitsuba as mi; mi.set_variant('scalar_rgb'); mitsuba()", **_usable_llvm())
+    run = run_python(
+        "from mi_prt.system.runtime import mitsuba\n"
+        "import mitsuba as mi; mi.set_variant('scalar_rgb'); mitsuba()",
+        **_usable_llvm(),
+    )
     message = run.stderr.splitlines()[-1]
     assert run.returncode == 1 and message.startswith("mi_prt.errors.RuntimeSetupError: ")
     assert "scalar_rgb" in message and "llvm_ad_rgb" in message and "cuda_ad_rgb" in message
@@ -130,22 +172,28 @@ def test_another_variant_is_refused_by_name():
 
 def test_a_usable_variant_is_kept_and_messages_go_to_stderr():
     """A result on stdout is parsed by programs, so not one message of Mitsuba may appear there."""
-    run = run_python("from mi_prt.system.runtime import mitsuba, quiet_mitsuba\n"
-                     "mi = mitsuba(); quiet_mitsuba(); print(mi.variant(), mitsuba().variant())\n"
-                     "mi.Log(mi.LogLevel.Warn, 'told'); mi.Log(mi.LogLevel.Info, 'not told')", **_usable_llvm())
+    run = run_python(
+        "from mi_prt.system.runtime import mitsuba, quiet_mitsuba\n"
+        "mi = mitsuba(); quiet_mitsuba(); print(mi.variant(), mitsuba().variant())\n"
+        "mi.Log(mi.LogLevel.Warn, 'told'); mi.Log(mi.LogLevel.Info, 'not told')",
+        **_usable_llvm(),
+    )
     assert run.stdout == "llvm_ad_rgb llvm_ad_rgb\n", run.stderr
     assert "told" in run.stderr and "not told" not in run.stderr
 
 
 def test_kernels_are_counted_once_per_program_not_per_launch():
-    """A literal is part of the program and an opaque value is not: only new literals compile anew."""
+    """A literal is part of the program and an opaque value is not: only new literals compile
+    anew.
+    """
     mi = runtime.mitsuba()
     import drjit as dr
 
     def evaluate(factor):
         dr.eval(dr.sin(dr.arange(mi.Float, 100)) * factor)
 
-    evaluate(dr.opaque(mi.Float, 1.0))  # whatever making opaque values compiles is not to be counted
+    # whatever making opaque values compiles is not to be counted
+    evaluate(dr.opaque(mi.Float, 1.0))
     with runtime.count_kernels() as all_blocks:
         with runtime.count_kernels() as first:
             evaluate(0.70131)
@@ -183,10 +231,14 @@ def test_senseless_thread_counts_are_refused(count):
 
 @linux_only
 def test_peak_memory_counts_this_process_alone():
-    """The child allocates 64 MiB; the parent's 256 MiB, which getrusage would report, must not show."""
+    """The child allocates 64 MiB; the parent's 256 MiB, which getrusage would report, must not
+    show.
+    """
     parent = bytearray(b"\1" * (256 << 20))
-    run = run_python("from mi_prt.system.runtime import peak_memory_bytes as peak\n"
-                     "before = peak(); block = bytearray(b'\\1' * 1024) * (64 << 10); print(before, peak() - before)")
+    run = run_python(
+        "from mi_prt.system.runtime import peak_memory_bytes as peak\nbefore = peak(); block ="
+        " bytearray(b'\\1' * 1024) * (64 << 10); print(before, peak() - before)"
+    )
     before, grown = map(int, run.stdout.split())
     assert before < len(parent)
     assert 60 << 20 < grown < 80 << 20
@@ -195,7 +247,10 @@ def test_peak_memory_counts_this_process_alone():
 def test_versions_name_all_that_a_result_depends_on():
     found = runtime.versions()
     assert set(found) == {*runtime.PACKAGES, "python", "llvm"}
-    assert all(found[name][0].isdigit() for name in ("mitsuba", "drjit", "numpy", "scipy", "h5py", "python"))
+    assert all(
+        found[name][0].isdigit()
+        for name in ("mitsuba", "drjit", "numpy", "scipy", "h5py", "python")
+    )
 
 
 @pytest.mark.parametrize("name", ["glx", "pyglet"])
@@ -213,9 +268,11 @@ def test_missing_platforms_are_named_with_a_remedy(monkeypatch):
 
 
 def test_opengl_imported_before_for_a_screen_is_told_apart():
-    run = run_python("import os; os.environ['PYOPENGL_PLATFORM'] = 'glx'; import OpenGL.platform\n"
-                     "del os.environ['PYOPENGL_PLATFORM']\n"
-                     "from mi_prt.system.runtime import raster_platform; raster_platform()")
+    run = run_python(
+        "import os; os.environ['PYOPENGL_PLATFORM'] = 'glx'; import OpenGL.platform\n"
+        "del os.environ['PYOPENGL_PLATFORM']\n"
+        "from mi_prt.system.runtime import raster_platform; raster_platform()"
+    )
     assert "PyOpenGL was imported before mi_prt and took GLXPlatform" in run.stderr
 
 
@@ -223,7 +280,17 @@ def test_doctor_finds_this_machine_in_order():
     checks = doctor.examine()
     names = [check.name for check in checks]
     assert len(set(names)) == len(names)
-    assert {"python", "mitsuba", "drjit", "llvm", "rays", "threads", "embree", "cuda", "raster"} <= set(names)
+    assert {
+        "python",
+        "mitsuba",
+        "drjit",
+        "llvm",
+        "rays",
+        "threads",
+        "embree",
+        "cuda",
+        "raster",
+    } <= set(names)
     report = json.loads(json.dumps(doctor.as_dict(checks)))
     assert report["ok"], [check for check in checks if check.status == "fault"]
     assert all(set(check) == {"name", "status", "value", "remedy"} for check in report["checks"])
@@ -242,9 +309,15 @@ def test_doctor_survives_an_unusable_llvm_and_names_the_remedy(fake_library, mon
 
 def test_doctor_reports_a_probe_that_ends_its_process(monkeypatch):
     """What LLVM does when it cannot compile: a line on stderr, then SIGABRT (6)."""
-    monkeypatch.setattr(doctor, "_RAYS_PROBE", "import os; os.write(2, b'LLVM ERROR: no\\nmore\\n'); os.abort()")
+    monkeypatch.setattr(
+        doctor, "_RAYS_PROBE", "import os; os.write(2, b'LLVM ERROR: no\\nmore\\n'); os.abort()"
+    )
     check = doctor.check_rays()
-    assert check.status == "fault" and check.value == "ended by signal 6: LLVM ERROR: no" and check.remedy
+    assert (
+        check.status == "fault"
+        and check.value == "ended by signal 6: LLVM ERROR: no"
+        and check.remedy
+    )
 
 
 def _usable_llvm() -> dict[str, str]:

@@ -1,15 +1,17 @@
-"""The sample scenes: their generated files are reproducible, the teapot is sound, and Mitsuba loads them."""
+"""The sample scenes: their generated files are reproducible, the teapot is sound, and Mitsuba loads
+them.
+"""
 
 import importlib.util
 from pathlib import Path
 
+import mitsuba as mi
 import numpy as np
 import OpenEXR
 import pytest
 from PIL import Image
 
 import mi_prt  # noqa: F401  (selects LLVM for Mitsuba)
-import mitsuba as mi
 
 mi.set_variant("llvm_ad_rgb")
 
@@ -26,7 +28,9 @@ def teapot():
 
 
 def boundary_edges(face):
-    """Edges that only one triangle has; asserts that no edge has more than two, nor two with the same direction."""
+    """Edges that only one triangle has; asserts that no edge has more than two, nor two with the
+    same direction.
+    """
     directed = face[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
     assert len(np.unique(directed, axis=0)) == len(directed)
     edges, count = np.unique(np.sort(directed, axis=1), axis=0, return_counts=True)
@@ -47,12 +51,17 @@ def test_generator_reproduces_the_committed_files(tmp_path):
     assert [p.read_bytes() for p in first] == [p.read_bytes() for p in second]
 
     names = {p.relative_to(tmp_path / "first") for p in first}
-    committed = {p.relative_to(SCENES) for folder in ("meshes", "textures") for p in (SCENES / folder).iterdir()}
+    committed = {
+        p.relative_to(SCENES)
+        for folder in ("meshes", "textures")
+        for p in (SCENES / folder).iterdir()
+    }
     assert names == committed
     for path in first:
         original = SCENES / path.relative_to(tmp_path / "first")
         if path.read_bytes() != original.read_bytes():
-            # Another release of zlib or OpenEXR may pack the same pixels differently; nothing else may differ.
+            # Another release of zlib or OpenEXR may pack the same pixels differently; nothing else
+            # may differ.
             assert path.suffix in (".exr", ".png"), f"{path.name} differs"
             np.testing.assert_array_equal(pixels(path), pixels(original), err_msg=path.name)
 
@@ -66,10 +75,18 @@ def test_patches_interpolate_their_corners_and_match_finite_differences():
         np.testing.assert_allclose(point, net[::3, ::3], atol=1e-12)
         at, h = np.array([0.3, 0.6]), 1e-5
         point, normal = generate.evaluate_patch(net, at, at)
-        along_u = (generate.evaluate_patch(net, at + h, at)[0] - generate.evaluate_patch(net, at - h, at)[0]) / (2 * h)
-        along_v = (generate.evaluate_patch(net, at, at + h)[0] - generate.evaluate_patch(net, at, at - h)[0]) / (2 * h)
+        along_u = (
+            generate.evaluate_patch(net, at + h, at)[0]
+            - generate.evaluate_patch(net, at - h, at)[0]
+        ) / (2 * h)
+        along_v = (
+            generate.evaluate_patch(net, at, at + h)[0]
+            - generate.evaluate_patch(net, at, at - h)[0]
+        ) / (2 * h)
         cross = np.cross(along_u, along_v)
-        np.testing.assert_allclose(normal, cross / np.linalg.norm(cross, axis=-1, keepdims=True), atol=1e-7)
+        np.testing.assert_allclose(
+            normal, cross / np.linalg.norm(cross, axis=-1, keepdims=True), atol=1e-7
+        )
 
 
 def test_teapot_normals_and_winding(teapot):
@@ -83,7 +100,8 @@ def test_teapot_normals_and_winding(teapot):
     assert area.min() > 1e-5  # no slivers, in particular none at the poles
     facing = np.einsum("fkc,fc->fk", normal[face], cross) / (2 * area[:, None])
     assert facing.min() > 0.5 and np.percentile(facing, 1) > 0.9
-    # Outwards: an inside-out surface would have a negative volume. Body of revolution: radius <= 2, height <= 3.15.
+    # Outwards: an inside-out surface would have a negative volume. Body of revolution: radius <= 2,
+    # height <= 3.15.
     volume = np.einsum("fc,fc->", a, np.cross(b, c)) / 6
     assert 20 < volume < np.pi * 2**2 * 3.15
 
@@ -102,7 +120,8 @@ def test_teapot_topology(teapot):
     position, _, _, face = teapot
     n = generate.TEAPOT_DIVISIONS
     boundary, edges = boundary_edges(face)
-    # Open edges: the rim and the lid (4 patches round each), both ends of the handle and of the spout (2 patches each).
+    # Open edges: the rim and the lid (4 patches round each), both ends of the handle and of the
+    # spout (2 patches each).
     assert len(boundary) == (4 + 4 + 2 * 2 + 2 * 2) * n
     # Pot and lid are discs (Euler characteristic 1), handle and spout are open tubes (0).
     assert len(position) - edges + len(face) == 2
@@ -116,10 +135,14 @@ def test_teapot_file_holds_the_mesh(teapot):
     position, normal, uv, face = teapot
     mesh = mi.load_dict({"type": "ply", "filename": str(SCENES / "meshes/teapot.ply")})
     params = mi.traverse(mesh)
-    np.testing.assert_array_equal(np.array(params["vertex_positions"]).reshape(-1, 3), position.astype(np.float32))
+    np.testing.assert_array_equal(
+        np.array(params["vertex_positions"]).reshape(-1, 3), position.astype(np.float32)
+    )
     # Mitsuba normalises again on loading.
     np.testing.assert_allclose(np.array(params["vertex_normals"]).reshape(-1, 3), normal, atol=1e-6)
-    np.testing.assert_array_equal(np.array(params["vertex_texcoords"]).reshape(-1, 2), uv.astype(np.float32))
+    np.testing.assert_array_equal(
+        np.array(params["vertex_texcoords"]).reshape(-1, 2), uv.astype(np.float32)
+    )
     np.testing.assert_array_equal(np.array(params["faces"]).reshape(-1, 3), face)
 
 
@@ -128,9 +151,12 @@ def test_environment_maps_follow_mitsubas_layout(name):
     image = pixels(SCENES / "textures" / name).astype(np.float32)
     assert np.isfinite(image).all() and image.min() >= 0
     emitter = mi.load_dict({"type": "envmap", "filename": str(SCENES / "textures" / name)})
-    direction = generate.latlong_directions(*image.shape[:2])[1:-1]  # at the poles a column has no direction of its own
+    # at the poles a column has no direction of its own
+    direction = generate.latlong_directions(*image.shape[:2])[1:-1]
     si = mi.SurfaceInteraction3f()
-    si.wi = mi.Vector3f(*(mi.Float(-c.astype(np.float32).ravel()) for c in np.moveaxis(direction, -1, 0)))
+    si.wi = mi.Vector3f(
+        *(mi.Float(-c.astype(np.float32).ravel()) for c in np.moveaxis(direction, -1, 0))
+    )
     seen = np.array(emitter.eval(si)).T.reshape(direction.shape)
     np.testing.assert_allclose(seen, image[1:-1], rtol=1e-2, atol=1e-3)
 
@@ -146,6 +172,8 @@ def test_scene_loads_and_renders(path):
     scene = mi.load_file(str(path), optimize=False, parallel=False, width=16, height=12)
     assert len(scene.sensors()) == 1 and scene.shapes()
     inside = path.stem == "room"  # its lamp moves inside it; all others are under the sky
-    assert scene.emitters() and all(mi.has_flag(e.flags(), mi.EmitterFlags.Infinite) != inside for e in scene.emitters())
+    assert scene.emitters() and all(
+        mi.has_flag(e.flags(), mi.EmitterFlags.Infinite) != inside for e in scene.emitters()
+    )
     image = np.array(mi.render(scene, spp=8))
     assert image.shape == (12, 16, 3) and np.isfinite(image).all() and 0.05 < image.mean() < 1.0

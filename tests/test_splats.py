@@ -1,4 +1,5 @@
-"""Splats: what they show is a weighted mean of samples at what Mitsuba hits, and nothing of what it does not hit.
+"""Splats: what they show is a weighted mean of samples at what Mitsuba hits, and nothing of what it
+does not hit.
 
 Points on a lattice stand in for the samples of an asset, and irradiance is set by hand.
 """
@@ -18,14 +19,16 @@ from mi_prt.render.display import display
 from mi_prt.render.image import resized
 from mi_prt.render.raster import RasterScene
 from mi_prt.render.splats import SplatScene
-from mi_prt.system.runtime import count_kernels, mitsuba
 from mi_prt.scene.scene import open_scene
+from mi_prt.system.runtime import count_kernels, mitsuba
 
 SPACING = 0.1
 
 
 def splatted(points, irradiance, scene, sensor, samples=1, radius=2 * SPACING):
-    with SplatScene(points.positions, points.normals, np.full(len(points), radius), scene, sensor, samples) as splats:
+    with SplatScene(
+        points.positions, points.normals, np.full(len(points), radius), scene, sensor, samples
+    ) as splats:
         return splats.radiance(irradiance)
 
 
@@ -40,26 +43,35 @@ def uniform(points, value=np.pi):
 
 
 def weighted_mean(values, points, radius, places, normals):
-    """Values (k, 3) at places (k, 3) by the formula in the manual of SplatScene, written anew in NumPy."""
+    """Values (k, 3) at places (k, 3) by the formula in the manual of SplatScene, written anew in
+    NumPy.
+    """
     result = np.zeros((len(places), 3))
     for k, (place, normal) in enumerate(zip(places, normals)):
         q = place - points.positions
         d2 = (q**2).sum(axis=1) + 15 * (q * points.normals).sum(axis=1) ** 2
-        weight = np.exp(-4.5 * d2 / radius**2) * np.maximum(points.normals @ normal, 0) ** 8 * (d2 < radius**2)
+        weight = (
+            np.exp(-4.5 * d2 / radius**2)
+            * np.maximum(points.normals @ normal, 0) ** 8
+            * (d2 < radius**2)
+        )
         result[k] = weight @ values / weight.sum()
     return result
 
 
-# --- where light is shown --------------------------------------------------------------------------------------------
+# --- where light is shown -------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", SENSORS)
 def test_shows_the_weighted_mean_at_each_pixels_hit(name):
-    """A sample is 0.5/π times the weighted mean of the splats' irradiance at Mitsuba's own hit, on flat and curved shapes.
+    """A sample is 0.5/π times the weighted mean of the splats' irradiance at Mitsuba's own hit, on
+    flat and curved shapes.
 
-    Expectation: equal to rounding, but at the few hits that lie so near a splat's edge that rounding decides whether it counts.
-    There it weighs e^-4.5, so that is below 1 % of the irradiance's variation among neighbours. On the ball, splats that stick
-    out of it lose a part near their edges where they are seen at a slant: some percent of that variation along the outline.
+    Expectation: equal to rounding, but at the few hits that lie so near a splat's edge that
+    rounding decides whether it counts. There it weighs e^-4.5, so that is below 1 % of the
+    irradiance's variation among neighbours. On the ball, splats that stick out of it lose a part
+    near their edges where they are seen at a slant: some percent of that variation along the
+    outline.
     """
     scene, points, sensor = surroundings(
         sensor=camera((0.5, 4, 1.2), (0.1, 0, 0.1), **SENSORS[name]),
@@ -79,7 +91,9 @@ def test_shows_the_weighted_mean_at_each_pixels_hit(name):
     hit = np.array(si.is_valid())
     assert hit.mean() > 0.5
     normals = np.array(si.sh_frame.n).T[hit]
-    expected = 0.5 / np.pi * weighted_mean(irradiance, points, 2 * SPACING, np.array(si.p).T[hit], normals)
+    expected = (
+        0.5 / np.pi * weighted_mean(irradiance, points, 2 * SPACING, np.array(si.p).T[hit], normals)
+    )
     error = np.abs(seen.reshape(-1, 3)[hit] / expected - 1).max(axis=1)
     ball = np.array(si.shape == mitsuba().ShapePtr(scene.surfaces[2].shape))[hit]
     assert np.quantile(error[~ball], 0.99) < 2e-5
@@ -91,14 +105,18 @@ def test_shows_the_weighted_mean_at_each_pixels_hit(name):
 
 
 def test_a_smooth_function_is_shown_as_it_is():
-    """The mean over a splat's Gaussian of σ = 2/3 of the spacing blurs waves of length λ by 1 − exp(−2π²σ²/λ²).
+    """The mean over a splat's Gaussian of σ = 2/3 of the spacing blurs waves of length λ by 1 −
+    exp(−2π²σ²/λ²).
 
-    Set-up: waves of 12 spacings on a floor with jittered samples: a cell of a grid has one sample anywhere in it, so that they
-    are rougher than blue noise. Expectation: the blur, 6 % of the amplitude, and the noise of where the samples lie, which is
-    as much again. A lattice shows the blur alone.
+    Set-up: waves of 12 spacings on a floor with jittered samples: a cell of a grid has one sample
+    anywhere in it, so that they are rougher than blue noise. Expectation: the blur, 6 % of the
+    amplitude, and the noise of where the samples lie, which is as much again. A lattice shows the
+    blur alone.
     """
     rng = np.random.default_rng(1)
-    scene, points, sensor = surroundings(sensor=camera((0.8, 2, 1), fov=40), floor=rectangle(size=2, bsdf=diffuse(1.0)))
+    scene, points, sensor = surroundings(
+        sensor=camera((0.8, 2, 1), fov=40), floor=rectangle(size=2, bsdf=diffuse(1.0))
+    )
     si, _ = hits(scene, sensor)
 
     def wave(x):
@@ -118,18 +136,30 @@ def test_a_smooth_function_is_shown_as_it_is():
 
 @pytest.mark.parametrize("samples", [1, 3])
 def test_constant_light_stays_constant(samples):
-    """Albedo ½, irradiance π and a sky of ½ make every pixel ½, as in a furnace, outlines and creases included."""
-    tube = {"type": "cylinder", "p0": [-1, 0, 0.7], "p1": [1, 0, 0.7], "radius": 0.3, "bsdf": two_sided(0.5, 0.5)}
+    """Albedo ½, irradiance π and a sky of ½ make every pixel ½, as in a furnace, outlines and
+    creases included.
+    """
+    tube = {
+        "type": "cylinder",
+        "p0": [-1, 0, 0.7],
+        "p1": [1, 0, 0.7],
+        "radius": 0.3,
+        "bsdf": two_sided(0.5, 0.5),
+    }
     plate = disk((1, 0.2, 0), (0.9, 0, -0.3), 0.4, bsdf=two_sided(0.5, 0.5))
     box = cube((-0.2, 0, -0.3), 0.4, bsdf=diffuse())
     ball = sphere((0.4, 0.2, 0.1), 0.3, bsdf=diffuse())
     sky = {"type": "constant", "radiance": 0.5}
     scene, points, sensor = surroundings(box=box, ball=ball, tube=tube, plate=plate, sky=sky)
-    np.testing.assert_allclose(splatted(points, uniform(points), scene, sensor, samples), 0.5, rtol=1e-5)
+    np.testing.assert_allclose(
+        splatted(points, uniform(points), scene, sensor, samples), 0.5, rtol=1e-5
+    )
 
 
 def test_from_within_a_room():
-    """Splats all around the viewer, some across the plane of the eye, and the nearest one at a thousandth of its radius."""
+    """Splats all around the viewer, some across the plane of the eye, and the nearest one at a
+    thousandth of its radius.
+    """
     near = film(64, 48)
     for origin in ((0.3, 0.2, 0.1), (0.0, -0.9998, 0.3)):
         sensor = camera(origin, (1, -1, 0.9), film=near, fov=100, near_clip=1e-4)
@@ -139,7 +169,9 @@ def test_from_within_a_room():
 
 
 def test_far_planes_and_large_scenes():
-    """The same image in metres and in thousandths of them, with a near plane at 1e-2 and a far one at 1e4 or 1e7 of it."""
+    """The same image in metres and in thousandths of them, with a near plane at 1e-2 and a far one
+    at 1e4 or 1e7 of it.
+    """
     images = []
     for scale in (1.0, 1000.0):
         scene, points, sensor = surroundings(
@@ -156,7 +188,9 @@ def test_far_planes_and_large_scenes():
 
 @pytest.mark.parametrize("tilt", [0, 1])
 def test_something_right_in_front_of_the_lens(tilt):
-    """A disk a twentieth of a unit away takes no light from a floor at 30,000, though depth has 24 binary digits."""
+    """A disk a twentieth of a unit away takes no light from a floor at 30,000, though depth has 24
+    binary digits.
+    """
     scene, points, sensor = surroundings(
         spacing=500,
         sensor=camera((0, 0, 0), (0, -1, 0), near_clip=0.01, far_clip=1e6, fov=20),
@@ -169,11 +203,13 @@ def test_something_right_in_front_of_the_lens(tilt):
     np.testing.assert_allclose(seen[on_floor], 0.5, rtol=1e-5)
 
 
-# --- where none is shown ----------------------------------------------------------------------------------------------
+# --- where none is shown --------------------------------------------------------------------------
 
 
 def test_outlines_are_those_of_the_scene():
-    """Lit are exactly the pixels whose ray hits the lit shape first, however far its splats reach beyond it."""
+    """Lit are exactly the pixels whose ray hits the lit shape first, however far its splats reach
+    beyond it.
+    """
     scene, points, sensor = surroundings(
         floor=rectangle(size=2, bsdf=diffuse()),
         ball=sphere((0, 0.6, 0), 0.3, bsdf=diffuse()),
@@ -191,7 +227,9 @@ def test_outlines_are_those_of_the_scene():
 
 @pytest.mark.parametrize("height, expected", [(4, [0.2, 0.4, 0.6]), (-4, [0.5, 0.3, 0.1])])
 def test_each_side_has_its_own_light_and_albedo(height, expected):
-    """A two-sided plane fills the view; its front's irradiance is π, its back's 2π, so radiance is ρ and 2ρ."""
+    """A two-sided plane fills the view; its front's irradiance is π, its back's 2π, so radiance is
+    ρ and 2ρ.
+    """
     plane = rectangle(size=9, bsdf=two_sided([0.2, 0.4, 0.6], [0.25, 0.15, 0.05]))
     scene, points, sensor = surroundings(spacing=1.0, sensor=camera((0, height, 0.1)), plane=plane)
     irradiance = uniform(points) * np.where(points.normals[:, 1:2] < 0, 2, 1)
@@ -204,14 +242,18 @@ def test_black_back_hides_what_is_behind():
     plane = rectangle(size=9, bsdf=diffuse())
     ball = sphere((0, 2, 0), bsdf=diffuse())
     sky = {"type": "constant"}
-    scene, points, sensor = surroundings(spacing=0.5, sensor=camera((0, -4, 0.1)), plane=plane, ball=ball, sky=sky)
+    scene, points, sensor = surroundings(
+        spacing=0.5, sensor=camera((0, -4, 0.1)), plane=plane, ball=ball, sky=sky
+    )
     assert not splatted(points, uniform(points), scene, sensor, radius=1).any()
 
 
 def test_no_leak_round_corners_and_through_thin_walls():
-    """A dark wall on a bright floor, a dark sheet of 0.26 radii above it, and the dark side of a bright sheet: black all over.
+    """A dark wall on a bright floor, a dark sheet of 0.26 radii above it, and the dark side of a
+    bright sheet: black all over.
 
-    Walls meet the floor at right angles, where n·n' is 0; and a splat reaches a quarter of its radius off its plane.
+    Walls meet the floor at right angles, where n·n' is 0; and a splat reaches a quarter of its
+    radius off its plane.
     """
     radius = 2 * SPACING
     scene, points, sensor = surroundings(
@@ -220,23 +262,33 @@ def test_no_leak_round_corners_and_through_thin_walls():
         wall=rectangle((0, 0, 1), (0, 0.5, -0.5), 0.5, bsdf=two_sided(0.5, 0.5)),
         sheet=rectangle((0, 1, 0), (0.4, 0.26 * radius, 0.4), 0.3, bsdf=two_sided(0.5, 0.5)),
     )
-    bright = (points.surface == 0) | (points.normals[:, 1] < -0.9) | (points.normals[:, 2] < -0.9)  # floor, and hidden sides
-    seen = splatted(points, np.where(bright[:, None], uniform(points), 0), scene, sensor).reshape(-1, 3)
+    # floor, and hidden sides
+    bright = (points.surface == 0) | (points.normals[:, 1] < -0.9) | (points.normals[:, 2] < -0.9)
+    seen = splatted(points, np.where(bright[:, None], uniform(points), 0), scene, sensor).reshape(
+        -1, 3
+    )
     si, _ = hits(scene, sensor)
     floor = np.array(si.shape == mitsuba().ShapePtr(scene.surfaces[0].shape))
     dark = np.array(si.is_valid()) & ~floor
     assert dark.sum() > 1000 and floor.sum() > 1000
     assert not seen[dark].any()
-    edge = np.abs(seen[floor] - 0.5).max(axis=1) > 1e-5  # what the sheet above takes from the floor is as little
+    # what the sheet above takes from the floor is as little
+    edge = np.abs(seen[floor] - 0.5).max(axis=1) > 1e-5
     assert not edge.any()
 
 
 def test_where_no_splat_reaches_it_is_black():
-    """A floor with samples in one half of it only: the other is black beyond a splat's radius, and hides the sky."""
-    scene, points, sensor = surroundings(sky={"type": "constant"}, floor=rectangle(size=1, bsdf=diffuse()))
+    """A floor with samples in one half of it only: the other is black beyond a splat's radius, and
+    hides the sky.
+    """
+    scene, points, sensor = surroundings(
+        sky={"type": "constant"}, floor=rectangle(size=1, bsdf=diffuse())
+    )
     half = points.positions[:, 0] < 0
     radii = np.full(half.sum(), 2 * SPACING)
-    with SplatScene(points.positions[half], points.normals[half], radii, scene, sensor, 1) as splats:
+    with SplatScene(
+        points.positions[half], points.normals[half], radii, scene, sensor, 1
+    ) as splats:
         seen = splats.radiance(np.full((half.sum(), 3), np.pi))[..., 0].ravel()
     si, _ = hits(scene, sensor)
     x, hit = np.array(si.p[0]), np.array(si.is_valid())
@@ -245,17 +297,26 @@ def test_where_no_splat_reaches_it_is_black():
     np.testing.assert_array_equal(seen[~hit], 1)
 
 
-# --- what is not in the splats -----------------------------------------------------------------------------------------
+# --- what is not in the splats --------------------------------------------------------------------
 
 
 def test_textures_lamps_and_sky_are_as_fine_as_the_image():
-    """Under constant irradiance π a pixel is the albedo at its centre's hit, or what an emitter sends along the ray.
+    """Under constant irradiance π a pixel is the albedo at its centre's hit, or what an emitter
+    sends along the ray.
 
-    Checks of 0.02 m are far below the samples' spacing. Expectation: Mitsuba's own values at the same rays, to rounding.
+    Checks of 0.02 m are far below the samples' spacing. Expectation: Mitsuba's own values at the
+    same rays, to rounding.
     """
     transform = mitsuba().ScalarTransform4f
-    checks = {"type": "checkerboard", "color0": 0.2, "color1": 0.7, "to_uv": transform().scale([100, 100, 1])}
-    sky = sky_of(lambda d: np.stack([2 + d[:, 0], 1 + 0.5 * np.sin(3 * d[:, 1]), 1.5 - d[:, 2]], axis=-1))
+    checks = {
+        "type": "checkerboard",
+        "color0": 0.2,
+        "color1": 0.7,
+        "to_uv": transform().scale([100, 100, 1]),
+    }
+    sky = sky_of(
+        lambda d: np.stack([2 + d[:, 0], 1 + 0.5 * np.sin(3 * d[:, 1]), 1.5 - d[:, 2]], axis=-1)
+    )
     lamp = {"type": "area", "radiance": {"type": "rgb", "value": [7, 6, 5]}}
     scene, points, sensor = surroundings(
         sensor=camera((0, 3, 0.8), film=film(96, 72)),
@@ -271,16 +332,28 @@ def test_textures_lamps_and_sky_are_as_fine_as_the_image():
     on_floor = hit & ~shining
     assert on_floor.sum() > 1000 and shining.sum() > 100 and (~hit).sum() > 100
     np.testing.assert_allclose(seen[on_floor], albedo[on_floor], rtol=1e-5)
-    np.testing.assert_allclose(seen[shining], np.broadcast_to([7, 6, 5], seen[shining].shape), rtol=1e-6)
-    np.testing.assert_allclose(seen[~hit], emitted(scene.mi_scene.environment(), directions)[~hit], atol=2e-5)
+    np.testing.assert_allclose(
+        seen[shining], np.broadcast_to([7, 6, 5], seen[shining].shape), rtol=1e-6
+    )
+    np.testing.assert_allclose(
+        seen[~hit], emitted(scene.mi_scene.environment(), directions)[~hit], atol=2e-5
+    )
 
 
 def test_smooth_normals_and_instances():
-    """A coarse ball of smooth normals and a moved instance of another: constant light stays constant on both."""
+    """A coarse ball of smooth normals and a moved instance of another: constant light stays
+    constant on both.
+    """
     around = np.linspace(0, 2 * np.pi, 13)[:-1]
-    ring = [[np.cos(a) * np.sin(t), np.cos(t), np.sin(a) * np.sin(t)] for t in np.radians([30, 60, 90, 120, 150]) for a in around]
+    ring = [
+        [np.cos(a) * np.sin(t), np.cos(t), np.sin(a) * np.sin(t)]
+        for t in np.radians([30, 60, 90, 120, 150])
+        for a in around
+    ]
     vertices = np.array([[0, 1, 0], *ring, [0, -1, 0]])
-    faces = [[0, 1 + (i + 1) % 12, 1 + i] for i in range(12)] + [[61, 49 + i, 49 + (i + 1) % 12] for i in range(12)]
+    faces = [[0, 1 + (i + 1) % 12, 1 + i] for i in range(12)] + [
+        [61, 49 + i, 49 + (i + 1) % 12] for i in range(12)
+    ]
     for row in range(4):
         for i in range(12):
             a, b = 1 + 12 * row + i, 1 + 12 * row + (i + 1) % 12
@@ -298,17 +371,23 @@ def test_smooth_normals_and_instances():
     assert not seen[~hit].any()
 
 
-# --- use -----------------------------------------------------------------------------------------------------------------
+# --- use ------------------------------------------------------------------------------------------
 
 
 def test_draws_again_under_other_light_and_beside_the_other_renderer():
-    """Linear in irradiance, and back to the first image bit for bit, also when triangles were drawn in between."""
-    scene, asset, sensor = opened(floor=rectangle(size=1, bsdf=diffuse()), ball=sphere(radius=0.4, bsdf=diffuse(0.3)))
+    """Linear in irradiance, and back to the first image bit for bit, also when triangles were drawn
+    in between.
+    """
+    scene, asset, sensor = opened(
+        floor=rectangle(size=1, bsdf=diffuse()), ball=sphere(radius=0.4, bsdf=diffuse(0.3))
+    )
     points = asset.points
     irradiance = np.random.default_rng(1).uniform(0, 2, points.positions.shape).astype(np.float32)
     with RasterScene(asset, scene, sensor) as raster:
         triangles = raster.radiance(irradiance)
-        with SplatScene(points.positions, points.normals, np.full(len(points), 0.5), scene, sensor) as splats:
+        with SplatScene(
+            points.positions, points.normals, np.full(len(points), 0.5), scene, sensor
+        ) as splats:
             first, double = splats.radiance(irradiance), splats.radiance(2 * irradiance)
             np.testing.assert_array_equal(raster.radiance(irradiance), triangles)
             again = splats.radiance(irradiance)
@@ -320,7 +399,9 @@ def test_draws_again_under_other_light_and_beside_the_other_renderer():
 
 
 def test_a_moving_camera_compiles_nothing():
-    """Three cameras, as a turntable has them: all that the second and third one need was compiled for the first."""
+    """Three cameras, as a turntable has them: all that the second and third one need was compiled
+    for the first.
+    """
     floor = rectangle(size=1, bsdf=diffuse())
     for height in (3, 3.5, 4.1):
         scene, points, sensor = surroundings(sensor=camera((0, height, 0.1)), floor=floor)
@@ -335,7 +416,9 @@ def test_nothing_to_see():
     scene, points, sensor = surroundings(sensor=camera(target=(0, 8, 0)), floor=floor, sky=sky)
     np.testing.assert_allclose(splatted(points, uniform(points), scene, sensor), 2, rtol=1e-6)
     scene, points, sensor = surroundings(floor=rectangle(size=9, bsdf=diffuse()), spacing=1.0)
-    with SplatScene(points.positions, -points.normals, np.full(len(points), 2.0), scene, sensor, 1) as splats:
+    with SplatScene(
+        points.positions, -points.normals, np.full(len(points), 2.0), scene, sensor, 1
+    ) as splats:
         assert not splats.radiance(uniform(points)).any()
 
 
@@ -353,11 +436,16 @@ def test_errors_name_what_is_supported():
             SplatScene(x, n, radii, scene, sensor)
     with pytest.raises(SettingsError, match="1 or more"):
         SplatScene(x[:0], n[:0], r[:0], scene, sensor)
-    with SplatScene(x, n, r, scene, sensor) as splats, pytest.raises(SettingsError, match=r"irradiance .* shape \(\d+, 3\)"):
+    with (
+        SplatScene(x, n, r, scene, sensor) as splats,
+        pytest.raises(SettingsError, match=r"irradiance .* shape \(\d+, 3\)"),
+    ):
         splats.radiance(x[:-1])
     with resized(sensor, (20_000, 4)), pytest.raises(SettingsError, match="limit"):
         SplatScene(x, n, r, scene, sensor)
-    fluxmeter = open_scene({"type": "scene", "floor": rectangle(sensor={"type": "irradiancemeter", "film": film()})})
+    fluxmeter = open_scene(
+        {"type": "scene", "floor": rectangle(sensor={"type": "irradiancemeter", "film": film()})}
+    )
     with pytest.raises(SettingsError, match="perspective, thinlens, orthographic"):
         SplatScene(x, n, r, scene, fluxmeter.mi_scene.sensors()[0])
 
@@ -373,11 +461,17 @@ np.save(sys.argv[1], splatted(points, 3 + points.positions, scene, sensor))
 
 @pytest.mark.parametrize("platform", ["osmesa", "egl"])
 def test_platforms_draw_the_same(platform, tmp_path):
-    """A process of its own for each platform, because it cannot be changed once OpenGL is loaded; see test_raster."""
+    """A process of its own for each platform, because it cannot be changed once OpenGL is loaded;
+    see test_raster.
+    """
     tests = Path(__file__).parent
     result = subprocess.run(
         [sys.executable, "-c", PROGRAM, str(tmp_path / "image.npy")],
-        env=os.environ | {"PYOPENGL_PLATFORM": platform, "PYTHONPATH": os.pathsep.join([str(tests), str(tests.parent)])},
+        env=os.environ
+        | {
+            "PYOPENGL_PLATFORM": platform,
+            "PYTHONPATH": os.pathsep.join([str(tests), str(tests.parent)]),
+        },
         capture_output=True,
         text=True,
         timeout=120,

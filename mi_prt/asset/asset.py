@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
-from . import asset_file
 from ..lighting.environment import LightWarning
 from ..lighting.light import as_light
 from ..lighting.local import arrival, hull_warning, refuse_all_but_point_lights
-from ..system.parallel import BLOCK_ROWS, map_chunks, one_blas_thread
 from ..points.interpolate import PatchInterpolator
 from ..points.points import Points
+from ..system.parallel import BLOCK_ROWS, map_chunks, one_blas_thread
+from . import asset_file
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,16 +28,16 @@ class Asset:
     directions : DirectionLattice
     basis : a basis of `basis.bases.BASES`
     coefficients : (n, d) float32
-        An array, (n, 3, d) where reflections colour the light and the basis does not; a sparse array for the basis `haar`; the sampled
-        `DirectTransport` (n, s) for the basis `none`.
+        An array, (n, 3, d) where reflections colour the light and the basis does not; a sparse
+        array for the basis `haar`; the sampled `DirectTransport` (n, s) for the basis `none`.
     scene : dict
         kind, path, parameters, hash and left_out (what of the scene is not modelled).
     settings : dict
         What the run used.
     versions : dict
     report : dict
-        Counts from sampling (rays, dark and buried points), captured variance and relative error of the transport, and how light
-        splits by reflections (see `indirect`).
+        Counts from sampling (rays, dark and buried points), captured variance and relative error of
+        the transport, and how light splits by reflections (see `indirect`).
     path : Path or None
         The file it was loaded from or saved to.
     """
@@ -53,7 +53,7 @@ class Asset:
     report: dict
     path: Path | None = field(default=None, compare=False)
 
-    # --- light ---------------------------------------------------------------------------------------------------
+    # --- light ------------------------------------------------------------------------------------
 
     def project_light(self, light):
         """Distant light in this asset's basis.
@@ -108,11 +108,13 @@ class Asset:
 
     @property
     def reference_bounces(self):
-        """Reflections that the truth has: as many as were asked for; None, any number, where that was left to the scene."""
+        """Reflections that the truth has: as many as were asked for; None, any number, where that
+        was left to the scene.
+        """
         bounces = self.settings["bounces"]
         return None if bounces == "auto" else bounces
 
-    # --- relighting ----------------------------------------------------------------------------------------------
+    # --- relighting -------------------------------------------------------------------------------
 
     def irradiance(self, light, nearest=1):
         """Irradiance at the points, (n, 3) float32 in W/m².
@@ -127,7 +129,8 @@ class Asset:
         Warns
         -----
         LightWarning
-            If a local light is inside the convex hull of the scene: transport holds visibility to infinity.
+            If a local light is inside the convex hull of the scene: transport holds visibility to
+            infinity.
         """
         light = as_light(light)
         warning = hull_warning(light.point_lights, self.points.hull) if light.point_lights else None
@@ -136,14 +139,16 @@ class Asset:
         return self.irradiance_from(*self.project_light(light), light.point_lights, nearest)
 
     def irradiance_from(self, coefficients, mean_response, point_lights=(), nearest=1):
-        """Irradiance (n, 3) from distant light that is projected already, c·ℓ + m (Eigentransport eq. 10, mean kept exactly),
-        and local lights.
+        """Irradiance (n, 3) from distant light that is projected already, c·ℓ + m (Eigentransport
+        eq. 10, mean kept exactly), and local lights.
 
         What compression leaves of the sum below zero is zero.
         """
         with one_blas_thread():
             if self._channels_apart:
-                irradiance = np.matmul(self.coefficients.swapaxes(0, 1), coefficients.T[..., None])[..., 0].T
+                irradiance = np.matmul(self.coefficients.swapaxes(0, 1), coefficients.T[..., None])[
+                    ..., 0
+                ].T
             else:
                 irradiance = self.coefficients @ coefficients
         irradiance += mean_response
@@ -152,12 +157,16 @@ class Asset:
         return np.maximum(irradiance, 0, out=irradiance)
 
     def local_irradiance(self, point_lights, nearest=1):
-        """Irradiance (n, 3) float32 in W/m² by local lights alone, wherever they are; see `irradiance`."""
+        """Irradiance (n, 3) float32 in W/m² by local lights alone, wherever they are; see
+        `irradiance`.
+        """
         none = np.zeros((len(self.points), 3), np.float32)
         return np.maximum(sum((self._arriving(light, nearest) for light in point_lights), none), 0)
 
     def _arriving(self, light, nearest):
-        """Response (n, 3) to a local light: the transport of the directions it is seen in times I/r² (eq. 4, erratum 3)."""
+        """Response (n, 3) to a local light: the transport of the directions it is seen in times
+        I/r² (eq. 4, erratum 3).
+        """
         cells, irradiance = arrival(light, self.points.positions, self.directions, nearest)
 
         def transport(first):
@@ -168,7 +177,10 @@ class Asset:
         return irradiance * (seen if seen.ndim == 2 else seen[:, None])
 
     def relight(self, light, nearest=1):
-        """Outgoing radiance B = ρ/π · E at the points, (n, 3) float32 in W/(m²·sr). See `irradiance`."""
+        """Outgoing radiance B = ρ/π · E at the points, (n, 3) float32 in W/(m²·sr).
+
+        See `irradiance`.
+        """
         return self.outgoing_radiance(self.irradiance(light, nearest))
 
     def outgoing_radiance(self, irradiance):
@@ -180,14 +192,16 @@ class Asset:
         return self.points.albedo * np.float32(1 / np.pi)
 
     def transport(self, rows):
-        """Transport (len(rows), s) float32 as the basis reconstructs it, or (len(rows), 3, s); `rows` indexes points."""
+        """Transport (len(rows), s) float32 as the basis reconstructs it, or (len(rows), 3, s);
+        `rows` indexes points.
+        """
         return self.basis.reconstruct(self.coefficients[rows])
 
     def interpolator(self, scene):
         """What gives irradiance between the points at hits on a Scene, a PatchInterpolator."""
         return PatchInterpolator(scene, self.points, self.buried)
 
-    # --- file ----------------------------------------------------------------------------------------------------
+    # --- file -------------------------------------------------------------------------------------
 
     def save(self, path, folder=None):
         """Write the asset to one file, all or nothing; see `asset_file`.
@@ -196,7 +210,8 @@ class Asset:
         ----------
         path : path
         folder : path, optional
-            Where the file is until it is whole: on the same file system, by default in the folder of `path`.
+            Where the file is until it is whole: on the same file system, by default in the folder
+            of `path`.
 
         Raises
         ------

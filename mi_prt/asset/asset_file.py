@@ -8,13 +8,13 @@ import json
 import numpy as np
 import scipy.sparse
 
-from . import container
 from ..basis.bases import BASES
 from ..basis.haar import row_ends
 from ..directions import parse_directions
 from ..points.lattice import Patches, node_count
 from ..points.points import POINT_FIELDS, Points
 from ..transport.direct import DirectTransport
+from . import container
 
 UNITS = {
     "points/positions": "m",
@@ -71,11 +71,17 @@ def _arrays(asset):
 def coefficient_arrays(coefficients):
     """How coefficients are stored: arrays by their paths in the file."""
     if isinstance(coefficients, DirectTransport):
-        return {"coefficients/visibility": coefficients.bits[:], "coefficients/ray_vectors": coefficients.vectors}
+        return {
+            "coefficients/visibility": coefficients.bits[:],
+            "coefficients/ray_vectors": coefficients.vectors,
+        }
     if scipy.sparse.issparse(coefficients):
         n, s = coefficients.shape
         index = coefficients.indices.reshape(n, -1).astype(np.uint16 if s <= 1 << 16 else np.uint32)
-        return {"coefficients/indices": index, "coefficients/values": coefficients.data.reshape(n, -1)}
+        return {
+            "coefficients/indices": index,
+            "coefficients/values": coefficients.data.reshape(n, -1),
+        }
     return {"coefficients": coefficients}
 
 
@@ -119,7 +125,13 @@ def read(file, path):
     channels = fields["report"]["channels"]
     if channels not in (1, 3):
         raise ValueError(f"transport of {channels!r} channels")
-    _check_shapes(channels, **{name: fields[name] for name in ("points", "buried", "directions", "basis", "coefficients")})
+    _check_shapes(
+        channels,
+        **{
+            name: fields[name]
+            for name in ("points", "buried", "directions", "basis", "coefficients")
+        },
+    )
     return fields
 
 
@@ -137,7 +149,9 @@ def _read_coefficients(file, points, directions):
     if values.shape != index.shape or (index >= directions).any():
         raise ValueError("coefficients/values and indices do not fit together")
     n, k = values.shape
-    return scipy.sparse.csr_array((values.ravel(), index.ravel().astype(np.int32), row_ends(n, k)), (n, directions))
+    return scipy.sparse.csr_array(
+        (values.ravel(), index.ravel().astype(np.int32), row_ends(n, k)), (n, directions)
+    )
 
 
 def _check_shapes(channels, points, buried, directions, basis, coefficients):
@@ -145,7 +159,8 @@ def _check_shapes(channels, points, buried, directions, basis, coefficients):
     n, s, d = len(points), len(directions), len(basis)
     patches = points.patches
     p = len(patches.levels)
-    joint = channels == 1 or basis.kind == "pca"  # whether one set of coefficients serves all channels
+    # whether one set of coefficients serves all channels
+    joint = channels == 1 or basis.kind == "pca"
     row = (channels, s) if joint and channels > 1 else (s,)
     expected = {
         **{f"points/{name}": (getattr(points, name), (n, 3)) for name in POINT_FIELDS[:5]},
@@ -155,10 +170,22 @@ def _check_shapes(channels, points, buried, directions, basis, coefficients):
         "points/patches/levels": (patches.levels, (p, 2)),
         "points/patches/offsets": (patches.offsets, (p,)),
         "points/patches/back": (patches.back, (p,)),
-        "points/patches/nodes": (patches.nodes, (int(node_count(*patches.levels.T.astype(np.int64)).sum()),)),
-        "coefficients": (coefficients, (n, s if basis.kind == "haar" else d) if joint else (n, channels, d)),
+        "points/patches/nodes": (
+            patches.nodes,
+            (int(node_count(*patches.levels.T.astype(np.int64)).sum()),),
+        ),
+        "coefficients": (
+            coefficients,
+            (n, s if basis.kind == "haar" else d) if joint else (n, channels, d),
+        ),
     }
-    shapes = {"vectors": (d, *row), "mean": row, "sqrt_weights": (s,), "weights": (s,), "captured_variance": (d,)}
+    shapes = {
+        "vectors": (d, *row),
+        "mean": row,
+        "sqrt_weights": (s,),
+        "weights": (s,),
+        "captured_variance": (d,),
+    }
     expected |= {f"basis/{name}": (getattr(basis, name), shapes[name]) for name in basis.ARRAYS}
     for name, (array, shape) in expected.items():
         if array.shape != shape:

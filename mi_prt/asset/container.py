@@ -1,4 +1,6 @@
-"""The file that assets are stored in: named arrays and texts in HDF5, written all or nothing, read with typed errors."""
+"""The file that assets are stored in: named arrays and texts in HDF5, written all or nothing, read
+with typed errors.
+"""
 
 import io
 import json
@@ -36,7 +38,10 @@ def write(path, transport, arrays, attributes, folder=None):
     """
     import h5py
 
-    texts = {key: value if isinstance(value, str) else json.dumps(value, sort_keys=True) for key, value in attributes.items()}
+    texts = {
+        key: value if isinstance(value, str) else json.dumps(value, sort_keys=True)
+        for key, value in attributes.items()
+    }
     size = sum(a.nbytes for a in arrays.values()) + sum(map(len, texts.values())) + _OVERHEAD
     with replacing(path, folder) as temporary, _ReservedFile(temporary, size) as stream:
         with h5py.File(stream, "w") as file:
@@ -51,7 +56,8 @@ def write(path, transport, arrays, attributes, folder=None):
 
 @contextmanager
 def opened(path):
-    """Within the block, an asset's file as h5py.File, and its kind of transport; what it lacks raises AssetError.
+    """Within the block, an asset's file as h5py.File, and its kind of transport; what it lacks
+    raises AssetError.
 
     Parameters
     ----------
@@ -60,7 +66,8 @@ def opened(path):
     Raises
     ------
     AssetError
-        If the file is missing, truncated, no asset, or of a format version this program does not know.
+        If the file is missing, truncated, no asset, or of a format version this program does not
+        know.
     """
     import h5py
 
@@ -70,12 +77,16 @@ def opened(path):
     try:
         with h5py.File(path, "r") as file:
             if file.attrs.get("format") != FORMAT:
-                raise AssetError(f"'{path}' is an HDF5 file but no mi_prt asset: make one with `mi-prt precompute`")
+                raise AssetError(
+                    f"'{path}' is an HDF5 file but no mi_prt asset: make one with `mi-prt"
+                    " precompute`"
+                )
             version = int(file.attrs["format_version"])
             if version not in VERSIONS.values():
                 known = " and ".join(map(str, VERSIONS.values()))
                 raise AssetError(
-                    f"asset '{path}' has format version {version}, this program reads {known}: precompute it again"
+                    f"asset '{path}' has format version {version}, this program reads {known}:"
+                    " precompute it again"
                 )
             if not file.attrs.get("complete"):
                 raise AssetError(f"asset '{path}' is incomplete: precompute it again")
@@ -90,7 +101,8 @@ def opened(path):
 class _ReservedFile(io.FileIO):
     """An empty file whose space on the disk is taken before it is written.
 
-    HDF5 ends the process where a disk is full in the middle of a file; this raises OSError before HDF5 comes into it.
+    HDF5 ends the process where a disk is full in the middle of a file; this raises OSError before
+    HDF5 comes into it.
 
     Parameters
     ----------
@@ -114,7 +126,11 @@ class _ReservedFile(io.FileIO):
             raise
 
     def seek(self, offset, whence=os.SEEK_SET):
-        return super().seek(offset + self._end, os.SEEK_SET) if whence == os.SEEK_END else super().seek(offset, whence)
+        return (
+            super().seek(offset + self._end, os.SEEK_SET)
+            if whence == os.SEEK_END
+            else super().seek(offset, whence)
+        )
 
     def write(self, content):
         left = memoryview(content).cast("B")

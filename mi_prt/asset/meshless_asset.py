@@ -1,4 +1,6 @@
-"""The asset of a scene in which lights move: everything that relighting it needs (Meshless PRT, section 5)."""
+"""The asset of a scene in which lights move: everything that relighting it needs (Meshless PRT,
+section 5).
+"""
 
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -6,16 +8,16 @@ from pathlib import Path
 
 import numpy as np
 
-from . import meshless_file
 from ..errors import LightError, SettingsError
 from ..lighting.emission import Emission, emission_of
 from ..lighting.light import as_light
-from ..system.parallel import one_blas_thread
 from ..points.interpolate import SampleInterpolator
 from ..points.samples import Samples
+from ..system.parallel import one_blas_thread
 from ..transport.depth import DepthBuffers
 from ..transport.local_direct import LocalDirect
 from ..transport.transfer_matrix import Transfer
+from . import meshless_file
 
 COMPONENTS = ("total", "direct", "indirect")
 
@@ -64,7 +66,7 @@ class MeshlessAsset:
         bounces = self.settings["bounces"]
         return None if bounces == "auto" else bounces
 
-    # --- relighting ----------------------------------------------------------------------------------------------
+    # --- relighting -------------------------------------------------------------------------------
 
     def irradiance(self, light=None, component="total"):
         """Irradiance at the points, (n, 3) float32 in W/m².
@@ -72,7 +74,8 @@ class MeshlessAsset:
         Parameters
         ----------
         light : PointLight, SpotLight, AreaLight, Light, or a list of these, optional
-            Anywhere, inside the scene or outside; what they send adds up. By default the scene's own local emitters.
+            Anywhere, inside the scene or outside; what they send adds up. By default the scene's
+            own local emitters.
         component : 'total', 'direct' or 'indirect'
 
         Raises
@@ -83,7 +86,9 @@ class MeshlessAsset:
             If the component is another.
         """
         if component not in COMPONENTS:
-            raise SettingsError(f"component '{component}' is not known: use {', '.join(COMPONENTS)}")
+            raise SettingsError(
+                f"component '{component}' is not known: use {', '.join(COMPONENTS)}"
+            )
         direct, averaged = self._direct.irradiance(self.emission(light))
         if component == "direct":
             return direct
@@ -91,7 +96,10 @@ class MeshlessAsset:
         return indirect if component == "indirect" else direct + indirect
 
     def relight(self, light=None, component="total"):
-        """Outgoing radiance B = ρ/π · E at the points, (n, 3) float32 in W/(m²·sr). See `irradiance`."""
+        """Outgoing radiance B = ρ/π · E at the points, (n, 3) float32 in W/(m²·sr).
+
+        See `irradiance`.
+        """
         return self.outgoing_radiance(self.irradiance(light, component))
 
     def outgoing_radiance(self, irradiance):
@@ -107,8 +115,9 @@ class MeshlessAsset:
         light = as_light(light)
         if not light.distant.is_empty:
             raise LightError(
-                "this asset holds visibility and transfer for local lights (points='samples'), and a light is distant: pass point, "
-                "spot or area lights, or precompute the scene with points='vertices'"
+                "this asset holds visibility and transfer for local lights (points='samples'), and"
+                " a light is distant: pass point, spot or area lights, or precompute the scene with"
+                " points='vertices'"
             )
         return emission_of(light)
 
@@ -132,7 +141,7 @@ class MeshlessAsset:
         """What gives irradiance between the points at hits on a Scene, a SampleInterpolator."""
         return SampleInterpolator(scene, self.samples)
 
-    # --- file ----------------------------------------------------------------------------------------------------
+    # --- file -------------------------------------------------------------------------------------
 
     def save(self, path, folder=None):
         """Write the asset to one file, all or nothing; see `Asset.save`."""

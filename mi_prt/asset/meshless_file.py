@@ -1,18 +1,20 @@
-"""The asset of local lights as one self-describing HDF5 file; docs/asset-format.md describes it field by field."""
+"""The asset of local lights as one self-describing HDF5 file; docs/asset-format.md describes it
+field by field.
+"""
 
 import json
 
 import numpy as np
 import scipy.sparse
 
-from . import container
 from ..lighting.emission import Emission
 from ..points.lattice import Patches
 from ..points.points import POINT_FIELDS, Points
 from ..points.samples import Samples
-from .quantize import Quantized, cluster_scales, quantized, quantized_by_cluster
 from ..transport.depth import DepthBuffers
 from ..transport.transfer_matrix import Transfer
+from . import container
+from .quantize import Quantized, cluster_scales, quantized, quantized_by_cluster
 
 UNITS = {
     "points/positions": "m",
@@ -25,11 +27,15 @@ UNITS = {
 _TEXTS = ("scene", "settings", "versions", "report")
 _STORED_POINTS = tuple(name for name in POINT_FIELDS if name != "insets")  # samples have none
 _EMISSION = ("positions", "axes", "intensity", "cosine", "cutoff", "beam")
-_SPARSE_BELOW = 0.5  # share of entries that are not zero, below which 16-bit columns beside 16-bit values are less than all values
+# share of entries that are not zero, below which 16-bit columns beside 16-bit values are less than
+# all values
+_SPARSE_BELOW = 0.5
 
 
 def write(asset, path, folder=None):
-    """Write a `MeshlessAsset` to one file, all or nothing; parameters and errors as of `asset_file.write`."""
+    """Write a `MeshlessAsset` to one file, all or nothing; parameters and errors as of
+    `asset_file.write`.
+    """
     points, samples = asset.points, asset.samples
     arrays = {
         **{f"points/{name}": getattr(points, name) for name in _STORED_POINTS},
@@ -118,11 +124,15 @@ def _stored_matrix(matrix, bits):
     sparse = scipy.sparse.csr_array(kept)
     column = sparse.indices.astype(np.uint16 if kept.shape[1] <= 1 << 16 else np.uint32)
     values = stored.pop("transfer/matrix")
-    return arrays | stored | {
-        "transfer/entries": values[kept != 0],
-        "transfer/columns": column,
-        "transfer/ends": sparse.indptr.astype(np.int64),
-    }
+    return (
+        arrays
+        | stored
+        | {
+            "transfer/entries": values[kept != 0],
+            "transfer/columns": column,
+            "transfer/ends": sparse.indptr.astype(np.int64),
+        }
+    )
 
 
 def read(file, path):
@@ -163,12 +173,25 @@ def read(file, path):
     )
     transfer = None
     if "transfer" in file:
-        encoder, receivers = (_restored(file, f"transfer/{name}", starts) for name in ("encoder", "receivers"))
+        encoder, receivers = (
+            _restored(file, f"transfer/{name}", starts) for name in ("encoder", "receivers")
+        )
         c = len(starts) - 1
-        transfer = Transfer(encoder, receivers, _restored_matrix(file, (c, receivers.shape[1], c * encoder.shape[1])))
+        transfer = Transfer(
+            encoder,
+            receivers,
+            _restored_matrix(file, (c, receivers.shape[1], c * encoder.shape[1])),
+        )
     _check_shapes(samples, depth, transfer)
     own = Emission(**{name: file[f"lights/{name}"][()] for name in _EMISSION})
-    return {"samples": samples, "depth": depth, "transfer": transfer, "own_light": own, "path": path.absolute(), **texts}
+    return {
+        "samples": samples,
+        "depth": depth,
+        "transfer": transfer,
+        "own_light": own,
+        "path": path.absolute(),
+        **texts,
+    }
 
 
 def _restored(file, name, starts=None):
@@ -179,7 +202,9 @@ def _restored(file, name, starts=None):
             raise ValueError(f"{name} has no scale")
         return values
     scale = file[f"{name}_scale"][()]
-    return Quantized(values, scale if starts is None else np.repeat(scale, np.diff(starts), axis=0)).values
+    return Quantized(
+        values, scale if starts is None else np.repeat(scale, np.diff(starts), axis=0)
+    ).values
 
 
 def _restored_matrix(file, expected):
@@ -198,7 +223,9 @@ def _restored_matrix(file, expected):
         elif values.dtype != np.float32:
             raise ValueError("transfer/entries have no scale")
         columns = file["transfer/columns"][()].astype(np.int64)
-        sparse = scipy.sparse.csr_array((values.astype(np.float32), columns, ends), (len(rows), k * channels))
+        sparse = scipy.sparse.csr_array(
+            (values.astype(np.float32), columns, ends), (len(rows), k * channels)
+        )
         sparse.check_format(full_check=True)
         matrix[rows] = sparse.toarray()
     else:
@@ -212,7 +239,10 @@ def _check_shapes(samples, depth, transfer):
     points = samples.points
     directions = len(depth.hemisphere)
     expected = {
-        **{f"points/{name}": (getattr(points, name), (n, 3)) for name in ("positions", "normals", "geometric_normals", "albedo")},
+        **{
+            f"points/{name}": (getattr(points, name), (n, 3))
+            for name in ("positions", "normals", "geometric_normals", "albedo")
+        },
         "points/uv": (points.uv, (n, 2)),
         **{f"points/{name}": (getattr(points, name), (n,)) for name in ("areas", "surface")},
         "clusters/starts": (samples.starts, (c + 1,)),

@@ -2,9 +2,7 @@
 
 from pathlib import Path
 
-from . import asset_file
-from . import container
-from . import meshless_file
+from . import asset_file, container, meshless_file
 from .asset import Asset
 from .meshless_asset import MeshlessAsset
 
@@ -26,7 +24,8 @@ def load(path):
     Raises
     ------
     AssetError
-        If the file is missing, truncated, no asset, or of a format version this program does not know.
+        If the file is missing, truncated, no asset, or of a format version this program does not
+        know.
     """
     with container.opened(path) as (file, transport):
         kind, layout = _KINDS[transport]

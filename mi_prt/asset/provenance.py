@@ -10,7 +10,9 @@ from ..scene.scene import open_scene
 
 
 def describe_scene(scene, local_lights=False):
-    """What an asset records of its scene: kind, path, parameters, hash, appearance, left_out (which see)."""
+    """What an asset records of its scene: kind, path, parameters, hash, appearance, left_out (which
+    see).
+    """
     source = scene.source
     return {
         "kind": source.kind,
@@ -29,13 +31,14 @@ def left_out(scene, local_lights=False):
     ----------
     scene : Scene
     local_lights : bool
-        Whether the transport is that of local lights, at samples on any shape, or that of distant light, at vertices.
+        Whether the transport is that of local lights, at samples on any shape, or that of distant
+        light, at vertices.
 
     Returns
     -------
     list of dict
-        what, shapes (names), share (part of the light at 45° that those materials scatter in the way that is left out;
-        None where it cannot be told).
+        what, shapes (names), share (part of the light at 45° that those materials scatter in the
+        way that is left out; None where it cannot be told).
     """
     by_material = {}
     for surface in scene.surfaces:
@@ -50,13 +53,17 @@ def left_out(scene, local_lights=False):
             what = f"{surface.kind}: blocks light but reflects none"
             entries.append({"what": what, "shapes": [surface.name], "share": None})
         if surface.shape.interior_medium() or surface.shape.exterior_medium():
-            entries.append({"what": "participating medium", "shapes": [surface.name], "share": None})
+            entries.append(
+                {"what": "participating medium", "shapes": [surface.name], "share": None}
+            )
     lamps = {}
     for emitter in scene.distant_emitters if local_lights else scene.local_emitters:
         lamps[emitter.class_name()] = lamps.get(emitter.class_name(), 0) + 1
     where = "distant" if local_lights else "local"
     for kind, count in lamps.items():
-        entries.append({"what": f"{kind}: light of {count} {where} emitters", "shapes": [], "share": None})
+        entries.append(
+            {"what": f"{kind}: light of {count} {where} emitters", "shapes": [], "share": None}
+        )
     return entries
 
 
@@ -88,20 +95,27 @@ def open_scene_of(asset, scene=None, parameters=None):
     recorded = asset.scene
     if scene is None:
         if recorded["kind"] != "file":
-            raise SceneError(f"the asset came from a scene {recorded['kind']} in memory: pass the scene (--scene)")
+            raise SceneError(
+                f"the asset came from a scene {recorded['kind']} in memory: pass the scene"
+                " (--scene)"
+            )
         if not Path(recorded["path"]).is_file():
-            raise SceneError(f"the asset's scene '{recorded['path']}' is not there any more: pass its new path (--scene)")
+            raise SceneError(
+                f"the asset's scene '{recorded['path']}' is not there any more: pass its new path"
+                " (--scene)"
+            )
         scene = recorded["path"]
     opened = open_scene(scene, recorded["parameters"] if parameters is None else parameters)
     if opened.hash != recorded["hash"]:
         name = opened.source.path or f"the scene {opened.source.kind}"
         raise SceneError(
-            f"'{name}' is not the scene of the asset: its geometry or sidedness changed since it was precomputed; "
-            "precompute it again, or pass the right one (--scene)"
+            f"'{name}' is not the scene of the asset: its geometry or sidedness changed since it"
+            " was precomputed; precompute it again, or pass the right one (--scene)"
         )
     if asset.report["bounces"] and opened.appearance != recorded["appearance"]:
         warnings.warn(
-            "the scene's materials changed since it was precomputed: light that they reflect onto other surfaces is still that of the old ones",
+            "the scene's materials changed since it was precomputed: light that they reflect onto"
+            " other surfaces is still that of the old ones",
             LightWarning,
             stacklevel=2,
         )

@@ -1,4 +1,6 @@
-"""16-bit integers in the place of float32 numbers (Meshless PRT, section 4.4), with the error that they cannot exceed."""
+"""16-bit integers in the place of float32 numbers (Meshless PRT, section 4.4), with the error that
+they cannot exceed.
+"""
 
 from dataclasses import dataclass
 
@@ -9,7 +11,8 @@ LARGEST = 32767
 
 @dataclass(frozen=True, eq=False)
 class Quantized:
-    """Integers and what one of them is worth: values ≈ integers · scale, each within half its scale.
+    """Integers and what one of them is worth: values ≈ integers · scale, each within half its
+    scale.
 
     Parameters
     ----------
@@ -59,7 +62,12 @@ def quantized_by_cluster(values, starts):
     Quantized
         Its scale is (n, d); `cluster_scales` (c, d) has all that is in it.
     """
-    return _with_scale(values, np.repeat(np.maximum.reduceat(np.abs(values), starts[:-1], axis=0), np.diff(starts), axis=0))
+    return _with_scale(
+        values,
+        np.repeat(
+            np.maximum.reduceat(np.abs(values), starts[:-1], axis=0), np.diff(starts), axis=0
+        ),
+    )
 
 
 def cluster_scales(quantized, starts):

@@ -3,9 +3,7 @@
 from math import inf
 
 from ..errors import SettingsError
-from . import haar
-from . import harmonics
-from . import pca
+from . import haar, harmonics, pca
 from .haar import HaarBasis, SharedHaarBasis, check_haar, fit_haar, fit_haar_shared
 from .harmonics import HarmonicBasis, check_harmonics, fit_harmonics, most_harmonics
 from .none import NoBasis
@@ -24,7 +22,9 @@ def check_basis(kind):
         raise SettingsError(f"basis '{kind}' is not known: use {', '.join(BASES)}")
 
 
-def fit_basis(kind, rows, target, seed=0, progress=lambda done, total: None, max_bytes=inf, keep=compute_anew):
+def fit_basis(
+    kind, rows, target, seed=0, progress=lambda done, total: None, max_bytes=inf, keep=compute_anew
+):
     """Fit a basis that has components to choose (all but `none`) to rows of transport.
 
     Parameters
@@ -54,7 +54,8 @@ def fit_basis(kind, rows, target, seed=0, progress=lambda done, total: None, max
 
 
 def check_components(kind, directions, components):
-    """Raise SettingsError where a basis cannot be had on a lattice, or not in that number, before any work is done.
+    """Raise SettingsError where a basis cannot be had on a lattice, or not in that number, before
+    any work is done.
 
     Parameters
     ----------
@@ -68,7 +69,9 @@ def check_components(kind, directions, components):
 
 
 def default_components(kind, directions, points):
-    """How many components are taken where no number is asked for: what relights in about a millisecond, or as many as there are."""
+    """How many components are taken where no number is asked for: what relights in about a
+    millisecond, or as many as there are.
+    """
     if kind == "sh":
         return most_harmonics(directions, DEFAULT_HARMONICS)
     return min(DEFAULT_COEFFICIENTS, most_components(kind, directions, points))
@@ -83,7 +86,11 @@ def fit_bytes(kind, points, directions, components):
     """Memory that fitting a basis of so many components takes, its functions included."""
     if kind == "pca":
         return pca.fit_bytes(points, directions, components)
-    return {"sh": harmonics.FIT_BYTES, "haar-shared": haar.FIT_BYTES}.get(kind, 0) * components * directions
+    return (
+        {"sh": harmonics.FIT_BYTES, "haar-shared": haar.FIT_BYTES}.get(kind, 0)
+        * components
+        * directions
+    )
 
 
 def coefficient_bytes(kind, points, directions, components, rays_per_direction=1):

@@ -10,8 +10,9 @@ from ..system.parallel import one_blas_thread
 class Basis(ABC):
     """A basis of transport: made from its `ARRAYS`, with as many components as its length says.
 
-    Coefficients are whatever `coefficients @ light` and `coefficients[index]` work with: an array, a sparse array, or the sampled
-    transport. Irradiance is `coefficients @ ℓ + m` with what `project_light` returns.
+    Coefficients are whatever `coefficients @ light` and `coefficients[index]` work with: an array,
+    a sparse array, or the sampled transport. Irradiance is `coefficients @ ℓ + m` with what
+    `project_light` returns.
     """
 
     kind: str
@@ -31,11 +32,15 @@ class Basis(ABC):
 
     @abstractmethod
     def at(self, coefficients, cells):
-        """Transport (b, k) float32 of points with coefficients (b, d) in some cells (b, k) of the lattice each."""
+        """Transport (b, k) float32 of points with coefficients (b, d) in some cells (b, k) of the
+        lattice each.
+        """
 
     @abstractmethod
     def project_light(self, radiance):
-        """Light (d, 3) float32 in the basis, and the response of the mean (3,), from the radiance of cells (s, 3)."""
+        """Light (d, 3) float32 in the basis, and the response of the mean (3,), from the radiance
+        of cells (s, 3).
+        """
 
     def project(self, light, directions):
         """The same from a `Light` without local lights."""

@@ -1,12 +1,16 @@
-"""Haar wavelets over the faces of a cubemap (Ng, Ramamoorthi and Hanrahan 2003), orthonormal over the sphere.
+"""Haar wavelets over the faces of a cubemap (Ng, Ramamoorthi and Hanrahan 2003), orthonormal over
+the sphere.
 
-The wavelets are unbalanced: they know the solid angle of every cell. Neighbours with values t₁, t₂ and weights w₁, w₂ become
+The wavelets are unbalanced: they know the solid angle of every cell. Neighbours with values t₁, t₂
+and weights w₁, w₂ become
 
-    difference t₁ − t₂ of weight w₁w₂/(w₁ + w₂)   and   mean (w₁t₁ + w₂t₂)/(w₁ + w₂) of weight w₁ + w₂,
+    difference t₁ − t₂ of weight w₁w₂/(w₁ + w₂)   and   mean (w₁t₁ + w₂t₂)/(w₁ + w₂) of weight w₁ +
+    w₂,
 
-which keeps Σ w t². Each level does this to the columns in pairs and then to the rows in pairs (the nonstandard
-decomposition), and the next level to the means of means. A value times the root of its weight is an orthonormal coefficient;
-with aᵢ = √wᵢ tᵢ these are (√w₂ a₁ − √w₁ a₂)/√(w₁ + w₂) and (√w₁ a₁ + √w₂ a₂)/√(w₁ + w₂). A constant has six, one a face.
+which keeps Σ w t². Each level does this to the columns in pairs and then to the rows in pairs (the
+nonstandard decomposition), and the next level to the means of means. A value times the root of its
+weight is an orthonormal coefficient; with aᵢ = √wᵢ tᵢ these are (√w₂ a₁ − √w₁ a₂)/√(w₁ + w₂) and
+(√w₁ a₁ + √w₂ a₂)/√(w₁ + w₂). A constant has six, one a face.
 """
 
 from dataclasses import dataclass
@@ -23,21 +27,25 @@ from .linear import LinearBasis
 from .rows import Rows
 from .target import Fit, Target, centred, check_room, shares
 
-FIT_BYTES = 12  # for each wavelet of a shared set and direction: as a function, weighted, and to encode with
+# for each wavelet of a shared set and direction: as a function, weighted, and to encode with
+FIT_BYTES = 12
 
 
 @dataclass(frozen=True, eq=False)
 class HaarBasis(Basis):
-    """The k Haar wavelets of each transport row that matter most to it: the best approximation of the row by k of them.
+    """The k Haar wavelets of each transport row that matter most to it: the best approximation of
+    the row by k of them.
 
-    A row's coefficients are a row of a sparse matrix, which multiplied by the light's coefficients gives the irradiance.
+    A row's coefficients are a row of a sparse matrix, which multiplied by the light's coefficients
+    gives the irradiance.
 
     Parameters
     ----------
     sqrt_weights : (s,) float32
         √w of the cells of a cubemap.
     captured_variance : (k,) float64
-        Energy of the rows' largest coefficient, their second largest, …, over the transport's variance.
+        Energy of the rows' largest coefficient, their second largest, …, over the transport's
+        variance.
     """
 
     sqrt_weights: np.ndarray
@@ -55,25 +63,30 @@ class HaarBasis(Basis):
         return haar_transform(round(sqrt(len(self.sqrt_weights) / 6)))
 
     def encode(self, rows):
-        """Coefficients of transport rows (b, s): csr_array (b, s) float32 with exactly k entries a row, by column.
+        """Coefficients of transport rows (b, s): csr_array (b, s) float32 with exactly k entries a
+        row, by column.
 
         A row that has fewer wavelets is filled up with zeros.
         """
         coefficients = self._transform.forward(np.array(rows, np.float32))
         count, s = coefficients.shape
-        # Smallest first: with the largest last, NumPy is ten times slower on rows that are mostly zeros, as these are.
+        # Smallest first: with the largest last, NumPy is ten times slower on rows that are mostly
+        # zeros, as these are.
         largest = np.argpartition(-np.abs(coefficients), len(self) - 1, axis=1)[:, : len(self)]
         largest.sort(axis=1)
         entries = np.take_along_axis(coefficients, largest, axis=1)
         ends = row_ends(count, len(self))
-        return scipy.sparse.csr_array((entries.ravel(), largest.ravel().astype(np.int32), ends), shape=(count, s))
+        return scipy.sparse.csr_array(
+            (entries.ravel(), largest.ravel().astype(np.int32), ends), shape=(count, s)
+        )
 
     def reconstruct(self, coefficients):
         """Transport rows (b, s) float32 of coefficients (b, s)."""
         return self._transform.inverse(coefficients.toarray())
 
     def at(self, coefficients, cells):
-        """Transport (b, k) float32 of points with coefficients (b, s) in some cells (b, k) of the cubemap each.
+        """Transport (b, k) float32 of points with coefficients (b, s) in some cells (b, k) of the
+        cubemap each.
 
         It reads the 3·log₂ N + 1 wavelets that do not vanish in a cell.
         """
@@ -102,7 +115,9 @@ class HaarBasis(Basis):
 
 
 class SharedHaarBasis(LinearBasis):
-    """One set of Haar wavelets for all transport rows: those that carry the most energy of all rows together."""
+    """One set of Haar wavelets for all transport rows: those that carry the most energy of all rows
+    together.
+    """
 
     kind = "haar-shared"
 
@@ -110,10 +125,11 @@ class SharedHaarBasis(LinearBasis):
 class HaarTransform:
     """The orthonormal Haar transform of functions on a cubemap.
 
-    It works in place (lifting): 2 × 2 cells leave their mean at the last of them, where the next level finds it, and their
-    details at the three others. The index of a coefficient is thus that of a cell. A face's mean is at its last cell. For
-    the details of level e, row and column end in e binary ones; the bit before these is 0 in the row for a difference of
-    rows, in the column for a difference of columns, and in both for the difference of differences.
+    It works in place (lifting): 2 × 2 cells leave their mean at the last of them, where the next
+    level finds it, and their details at the three others. The index of a coefficient is thus that
+    of a cell. A face's mean is at its last cell. For the details of level e, row and column end in
+    e binary ones; the bit before these is 0 in the row for a difference of rows, in the column for
+    a difference of columns, and in both for the difference of differences.
 
     Parameters
     ----------
@@ -123,16 +139,23 @@ class HaarTransform:
 
     def __init__(self, resolution):
         self.resolution = resolution
-        weights = Cubemap(resolution).solid_angles[: resolution**2].reshape(resolution, resolution).copy()
-        self._shares = []  # w₁/(w₁ + w₂) of each level's pairs: of columns (2m, m) and of rows (m, 2m)
+        weights = (
+            Cubemap(resolution).solid_angles[: resolution**2].reshape(resolution, resolution).copy()
+        )
+        # w₁/(w₁ + w₂) of each level's pairs: of columns (2m, m) and of rows (m, 2m)
+        self._shares = []
         level = weights
         while len(level) > 1:
-            self._shares.append(tuple(_merge_weights(*pairs).astype(np.float32) for pairs in _pairs(level[None])))
+            self._shares.append(
+                tuple(_merge_weights(*pairs).astype(np.float32) for pairs in _pairs(level[None]))
+            )
             level = level[1::2, 1::2]
         self._roots = np.sqrt(weights).astype(np.float32)  # of what each coefficient weighs
 
     def forward(self, rows):
-        """Coefficients (b, s) float32 in the √w-weighted space of functions (b, s); a float32 array is overwritten."""
+        """Coefficients (b, s) float32 in the √w-weighted space of functions (b, s); a float32 array
+        is overwritten.
+        """
         faces = self._faces(rows)
         self._analyse(faces, 0)
         faces *= self._roots
@@ -153,7 +176,8 @@ class HaarTransform:
         -------
         wavelets : (s, 3·log₂ N + 1) int64
         values : (s, 3·log₂ N + 1) float32
-            Without weights: a function's value in cell j is Σ of its coefficients `wavelets[j]` times `values[j]`.
+            Without weights: a function's value in cell j is Σ of its coefficients `wavelets[j]`
+            times `values[j]`.
         """
         n = self.resolution
         rows, columns = np.indices((n, n)).reshape(2, -1)
@@ -161,13 +185,17 @@ class HaarTransform:
         for level, (column_shares, row_shares) in enumerate(self._shares):
             row, column = rows >> level, columns >> level
             block_row, block_column = row // 2, column // 2
-            # What a difference adds to the first of its pair, and to the second, for which the mean stands.
+            # What a difference adds to the first of its pair, and to the second, for which the mean
+            # stands.
             across = (column % 2 == 0) - column_shares[row, block_column]
             down_difference = (row % 2 == 0) - row_shares[block_row, 2 * block_column]
             down_mean = (row % 2 == 0) - row_shares[block_row, 2 * block_column + 1]
             details = {(0, 0): across * down_difference, (0, 1): down_mean, (1, 0): across}
             for (i, j), value in details.items():
-                place = [((2 * block + last + 1) << level) - 1 for block, last in ((block_row, i), (block_column, j))]
+                place = [
+                    ((2 * block + last + 1) << level) - 1
+                    for block, last in ((block_row, i), (block_column, j))
+                ]
                 wavelets.append(place[0] * n + place[1])
                 values.append(value)
         wavelets, values = np.stack(wavelets, axis=1), np.stack(values, axis=1)
@@ -203,7 +231,9 @@ haar_transform = cache(HaarTransform)
 
 
 def row_ends(rows, entries):
-    """Where the rows of a sparse array end that have so many entries each; of 32 bits, as SciPy then keeps the indices too."""
+    """Where the rows of a sparse array end that have so many entries each; of 32 bits, as SciPy
+    then keeps the indices too.
+    """
     return np.arange(rows + 1, dtype=np.int32 if rows * entries < 1 << 31 else np.int64) * entries
 
 
@@ -213,7 +243,9 @@ def _pairs(faces):
 
 
 def _merge_weights(first, second):
-    """Put the weights of differences and means in the place of weights w₁, w₂; returns w₁/(w₁ + w₂) of one face."""
+    """Put the weights of differences and means in the place of weights w₁, w₂; returns w₁/(w₁ + w₂)
+    of one face.
+    """
     both = first + second
     share = first / both
     first *= second / both
@@ -221,8 +253,11 @@ def _merge_weights(first, second):
     return share[0]
 
 
-def fit_haar(rows: Rows, target: Target, seed=0, progress=lambda done, total: None, max_bytes=inf) -> Fit:
-    """Find how many Haar wavelets a row are wanted, each row with its own, and how well they represent the rows.
+def fit_haar(
+    rows: Rows, target: Target, seed=0, progress=lambda done, total: None, max_bytes=inf
+) -> Fit:
+    """Find how many Haar wavelets a row are wanted, each row with its own, and how well they
+    represent the rows.
 
     Parameters
     ----------
@@ -255,10 +290,13 @@ def fit_haar(rows: Rows, target: Target, seed=0, progress=lambda done, total: No
     return Fit(basis, residual, variance, energies.sum())
 
 
-def fit_haar_shared(rows: Rows, target: Target, seed=0, progress=lambda done, total: None, max_bytes=inf) -> Fit:
+def fit_haar_shared(
+    rows: Rows, target: Target, seed=0, progress=lambda done, total: None, max_bytes=inf
+) -> Fit:
     """Find the one set of Haar wavelets that carries the most energy of all rows.
 
-    Parameters, progress and errors are those of `fit_haar`; the wavelets as functions must fit into `max_bytes`.
+    Parameters, progress and errors are those of `fit_haar`; the wavelets as functions must fit into
+    `max_bytes`.
 
     Returns
     -------
@@ -309,21 +347,26 @@ def _energies(rows, ranked):
 
 
 def check_haar(directions, components=None):
-    """Raise SettingsError where there are no Haar wavelets on a lattice, or not so many; see `fit_haar`."""
+    """Raise SettingsError where there are no Haar wavelets on a lattice, or not so many; see
+    `fit_haar`.
+    """
     if not (isinstance(directions, Cubemap) and directions.resolution.bit_count() == 1):
         below = 2 ** int(log2(min(max(sqrt(len(directions) / 6), 1), MAX_CUBEMAP_RESOLUTION // 2)))
         raise SettingsError(
-            f"Haar wavelets need a cubemap whose resolution is a power of two, got {directions}: use cubemap:{below} "
-            f"or cubemap:{2 * below}"
+            f"Haar wavelets need a cubemap whose resolution is a power of two, got {directions}:"
+            f" use cubemap:{below} or cubemap:{2 * below}"
         )
     if components is not None and not 1 <= components <= len(directions):
         raise SettingsError(
-            f"{components:,} Haar wavelets are outside 1…{len(directions):,}, the number of directions: ask for one within"
+            f"{components:,} Haar wavelets are outside 1…{len(directions):,}, the number of"
+            " directions: ask for one within"
         )
 
 
 def _fewest(target, energies, variance):
-    """How many of all energies, in descending order, the target takes, and how much is then left."""
+    """How many of all energies, in descending order, the target takes, and how much is then
+    left.
+    """
     left = np.append(np.cumsum(energies[::-1])[::-1], 0.0)
     components = target.components
     if components is None:

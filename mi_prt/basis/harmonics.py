@@ -1,4 +1,6 @@
-"""Real spherical harmonics: their values, how they turn with the sphere, and the basis of transport that they make."""
+"""Real spherical harmonics: their values, how they turn with the sphere, and the basis of transport
+that they make.
+"""
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -14,18 +16,21 @@ from .linear import LinearBasis
 from .rows import Rows
 from .target import Fit, Target, centred, check_room, shares
 
-MAX_BANDS = 33  # 1,089 functions: far beyond what low-frequency light needs, and cheap to turn still
+# 1,089 functions: far beyond what low-frequency light needs, and cheap to turn still
+MAX_BANDS = 33
 FIRST_BANDS = 10  # where a search for a share of the variance starts
 FIT_BYTES = 32  # for each function and direction: in float64, made orthonormal, and in float32
-LEAST_EIGENVALUE = 0.25  # of the functions' Gram matrix over a lattice's directions; 1 on the sphere
+# of the functions' Gram matrix over a lattice's directions; 1 on the sphere
+LEAST_EIGENVALUE = 0.25
 
 
 def evaluate(vectors, bands):
     """Real spherical harmonics, orthonormal over the sphere.
 
-    Their order is l·l + l + m with m = −l…l. With the polar angle θ from +z and the azimuth φ from +x towards +y they are
-    √2 P̄ₗᵐ(cos θ) cos mφ for m > 0, √2 P̄ₗ^|m|(cos θ) sin |m|φ for m < 0 and P̄ₗ(cos θ) for m = 0, P̄ normalized and
-    without the Condon-Shortley phase: l = 1 is √(3/4π) (y, z, x).
+    Their order is l·l + l + m with m = −l…l. With the polar angle θ from +z and the azimuth φ from
+    +x towards +y they are √2 P̄ₗᵐ(cos θ) cos mφ for m > 0, √2 P̄ₗ^|m|(cos θ) sin |m|φ for m < 0 and
+    P̄ₗ(cos θ) for m = 0, P̄ normalized and without the Condon-Shortley phase: l = 1 is √(3/4π) (y,
+    z, x).
 
     Parameters
     ----------
@@ -47,7 +52,8 @@ def evaluate(vectors, bands):
         if m > 0:
             sectoral = sectoral * sine * sqrt(1 + 1 / (2 * m))
         cosine_m, sine_m = sqrt(2) * np.cos(m * azimuth), sqrt(2) * np.sin(m * azimuth)
-        before, legendre = 0.0, sectoral  # P̄ₗ₋₁ᵐ and P̄ₗᵐ by the recurrence in l, which is stable upwards
+        # P̄ₗ₋₁ᵐ and P̄ₗᵐ by the recurrence in l, which is stable upwards
+        before, legendre = 0.0, sectoral
         for band in range(m, bands):
             if band > m:
                 grow = sqrt((4 * band * band - 1) / (band * band - m * m))
@@ -61,9 +67,10 @@ def evaluate(vectors, bands):
 def rotation(matrix, bands):
     """How spherical harmonics turn: Y(R ω) = D Y(ω), D of one block for each band.
 
-    Light L turned by R is L(R⁻¹ω), and its coefficients are Dℓ. The blocks follow from those of l = 1 by the recursion
-    of Ivanic and Ruedenberg (J. Phys. Chem. 100, 1996, tables 1 and 2, with the additions and corrections of 102, 1998).
-    Every term is a product of l = 1 and l − 1, so that a reflection's sign (−1)ˡ comes out of it by itself.
+    Light L turned by R is L(R⁻¹ω), and its coefficients are Dℓ. The blocks follow from those of l =
+    1 by the recursion of Ivanic and Ruedenberg (J. Phys. Chem. 100, 1996, tables 1 and 2, with the
+    additions and corrections of 102, 1998). Every term is a product of l = 1 and l − 1, so that a
+    reflection's sign (−1)ˡ comes out of it by itself.
 
     Parameters
     ----------
@@ -84,7 +91,8 @@ def rotation(matrix, bands):
     matrix = np.asarray(matrix, np.float64)
     if matrix.shape != (3, 3) or not np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-4):
         raise SettingsError(
-            f"spherical harmonics turn by a rotation or a reflection (3, 3), without scale or shear, got {matrix.tolist()}"
+            "spherical harmonics turn by a rotation or a reflection (3, 3), without scale or"
+            f" shear, got {matrix.tolist()}"
         )
     order = [1, 2, 0]  # l = 1 is y, z, x
     first = matrix[np.ix_(order, order)]
@@ -99,8 +107,8 @@ def _next_block(first, before, band):
 
     The square root of the denominator that u, v and w have in common is divided by at the end.
     """
-    # Pᵢ of i = −1, 0, 1. Rows are μ of band l − 1, between zeros: u, v and w take μ beyond it, with a factor of zero.
-    # Columns are m' of band l.
+    # Pᵢ of i = −1, 0, 1. Rows are μ of band l − 1, between zeros: u, v and w take μ beyond it, with
+    # a factor of zero. Columns are m' of band l.
     p = np.zeros((3, 2 * band + 3, 2 * band + 1))
     p[:, 2:-2, 1:-1] = first[:, 1, None, None] * before
     p[:, 2:-2, 0] = first[:, 2, None] * before[:, 0] + first[:, 0, None] * before[:, -1]
@@ -114,10 +122,16 @@ def _next_block(first, before, band):
     w = -np.sqrt((band - m) * (band - m - 1))[:, None] / 2
     v_same, v_other = v * np.where(near == 0, sqrt(2), 1)[:, None], v * (near != 0)[:, None]
     block = np.empty((2 * band + 1, 2 * band + 1))
-    block[band] = band * zero[centre] - sqrt(band * (band - 1) / 2) * (plus[centre + 1] + minus[centre - 1])
-    block[band + m] = u * zero[centre + m] + v_same * plus[centre + near] - v_other * minus[centre - near]
+    block[band] = band * zero[centre] - sqrt(band * (band - 1) / 2) * (
+        plus[centre + 1] + minus[centre - 1]
+    )
+    block[band + m] = (
+        u * zero[centre + m] + v_same * plus[centre + near] - v_other * minus[centre - near]
+    )
     block[band + m] += w * (plus[centre + far] + minus[centre - far])
-    block[band - m] = u * zero[centre - m] + v_same * minus[centre + near] + v_other * plus[centre - near]
+    block[band - m] = (
+        u * zero[centre - m] + v_same * minus[centre + near] + v_other * plus[centre - near]
+    )
     block[band - m] += w * (plus[centre - far] - minus[centre + far])
     denominators = band * band - np.arange(-band, band + 1) ** 2
     denominators[[0, -1]] = 2 * band * (2 * band - 1)
@@ -125,16 +139,21 @@ def _next_block(first, before, band):
 
 
 def rotate(coefficients, matrix):
-    """Coefficients (bands², channels) of light after it is turned by a (3, 3) rotation or reflection; see `rotation`."""
+    """Coefficients (bands², channels) of light after it is turned by a (3, 3) rotation or
+    reflection; see `rotation`.
+    """
     blocks = rotation(matrix, _bands_of(len(coefficients)))
-    return np.concatenate([block @ coefficients[band * band : (band + 1) ** 2] for band, block in enumerate(blocks)])
+    return np.concatenate(
+        [block @ coefficients[band * band : (band + 1) ** 2] for band, block in enumerate(blocks)]
+    )
 
 
 class HarmonicBasis(LinearBasis):
     """Spherical harmonics (Sloan, Kautz and Snyder 2002), sampled in the directions of a lattice.
 
-    There they are orthonormal only nearly: encoding is the least-squares projection on them, so that a reconstruction is the
-    best that they allow, and its response to light is c·ℓ exactly. The mean is zero.
+    There they are orthonormal only nearly: encoding is the least-squares projection on them, so
+    that a reconstruction is the best that they allow, and its response to light is c·ℓ exactly. The
+    mean is zero.
     """
 
     kind = "sh"
@@ -151,7 +170,9 @@ class HarmonicBasis(LinearBasis):
         return scipy.linalg.solve(vectors @ vectors.T, vectors, assume_a="pos").astype(np.float32)
 
     def project(self, light, directions):
-        """Light (d, 3) float32 in the basis, and no mean response; maps that `prepare` returned are turned in closed form."""
+        """Light (d, 3) float32 in the basis, and no mean response; maps that `prepare` returned are
+        turned in closed form.
+        """
         functions = str(directions), len(self)
         known = [m for m in light.maps if isinstance(m, HarmonicMap) and m.functions == functions]
         others = replace(light, maps=tuple(m for m in light.maps if m not in known))
@@ -162,7 +183,11 @@ class HarmonicBasis(LinearBasis):
         """A `Light` whose maps turn in closed form."""
         prepared = super().prepare(light, directions)
         maps = tuple(
-            HarmonicMap(m, (str(directions), len(self)), super(HarmonicBasis, self).project(Light(light.maps), directions)[0])
+            HarmonicMap(
+                m,
+                (str(directions), len(self)),
+                super(HarmonicBasis, self).project(Light(light.maps), directions)[0],
+            )
             for m in prepared.maps
         )
         return replace(prepared, maps=maps)
@@ -191,9 +216,13 @@ class HarmonicMap:
     rotation: np.ndarray = field(default_factory=lambda: np.eye(3))
 
     def rotated(self, axis, degrees):
-        """The same light turned about `axis` (x, y, z or a vector of 3) by `degrees`, right-handed."""
+        """The same light turned about `axis` (x, y, z or a vector of 3) by `degrees`,
+        right-handed.
+        """
         turn = rotation_matrix(axis, degrees)
-        return replace(self, environment=self.environment.rotated(axis, degrees), rotation=turn @ self.rotation)
+        return replace(
+            self, environment=self.environment.rotated(axis, degrees), rotation=turn @ self.rotation
+        )
 
     def turned(self):
         """ℓ (d, 3) float32 after the rotation."""
@@ -213,21 +242,25 @@ class HarmonicMap:
         return self.environment.quadrature(spacing)
 
 
-def fit_harmonics(rows: Rows, target: Target, seed=0, progress=lambda done, total: None, max_bytes=inf) -> Fit:
+def fit_harmonics(
+    rows: Rows, target: Target, seed=0, progress=lambda done, total: None, max_bytes=inf
+) -> Fit:
     """Find how many bands are wanted and how well they represent the rows.
 
-    A lattice tells functions apart as long as the eigenvalues of their Gram matrix over its directions stay above
-    `LEAST_EIGENVALUE`: on ``cubemap:N`` these are 2N bands.
+    A lattice tells functions apart as long as the eigenvalues of their Gram matrix over its
+    directions stay above `LEAST_EIGENVALUE`: on ``cubemap:N`` these are 2N bands.
 
     Parameters
     ----------
     rows : Rows
     target : Target
-        A square number of components, or a share of the variance that the fewest bands are taken for.
+        A square number of components, or a share of the variance that the fewest bands are taken
+        for.
     seed : int
         Not used: nothing is random.
     progress : callable(done, total)
-        Called after every pass over the rows, which is the only one unless a large share of the variance is asked for.
+        Called after every pass over the rows, which is the only one unless a large share of the
+        variance is asked for.
     max_bytes : float
         Memory that the fit may take.
 
@@ -239,18 +272,26 @@ def fit_harmonics(rows: Rows, target: Target, seed=0, progress=lambda done, tota
     Raises
     ------
     SettingsError
-        If the number of components is not a square, or above what the lattice tells apart or `MAX_BANDS` gives, or if that
-        many bands do not capture the share of the variance, or need more than `max_bytes`.
+        If the number of components is not a square, or above what the lattice tells apart or
+        `MAX_BANDS` gives, or if that many bands do not capture the share of the variance, or need
+        more than `max_bytes`.
     """
     largest = MAX_BANDS**2 if target.components is None else target.components
-    check_room(f"a basis of {largest:,} spherical harmonics", FIT_BYTES * largest * rows.shape[1], max_bytes)
+    check_room(
+        f"a basis of {largest:,} spherical harmonics",
+        FIT_BYTES * largest * rows.shape[1],
+        max_bytes,
+    )
     functions, gram = _functions(rows.directions, target.components)
     most = isqrt(len(functions))
     bands = most if target.variance is None else min(FIRST_BANDS, most)
     while True:
-        energies, variance, energy = _energies(rows, functions[: bands**2], gram[: bands**2, : bands**2])
+        energies, variance, energy = _energies(
+            rows, functions[: bands**2], gram[: bands**2, : bands**2]
+        )
         progress(bands, most)
-        residuals = np.maximum(energy - np.cumsum(energies)[np.arange(1, bands + 1) ** 2 - 1], 0)  # with 1…bands bands
+        # with 1…bands bands
+        residuals = np.maximum(energy - np.cumsum(energies)[np.arange(1, bands + 1) ** 2 - 1], 0)
         if target.variance is None:
             break
         enough = residuals <= target.allowed_residual(variance, energy)
@@ -260,8 +301,9 @@ def fit_harmonics(rows: Rows, target: Target, seed=0, progress=lambda done, tota
         if bands == most:
             captured = Fit(None, residuals[-1], variance, energy).captured_variance
             raise SettingsError(
-                f"spherical harmonics do not capture {target.variance} of the variance: the {bands**2:,} that "
-                f"{rows.directions} allows capture {captured:.6g}; ask for less, or for another basis"
+                f"spherical harmonics do not capture {target.variance} of the variance: the"
+                f" {bands**2:,} that {rows.directions} allows capture {captured:.6g}; ask for less,"
+                " or for another basis"
             )
         bands = min(2 * bands, most)
     progress(most, most)
@@ -275,9 +317,13 @@ def fit_harmonics(rows: Rows, target: Target, seed=0, progress=lambda done, tota
 
 
 def _energies(rows, functions, gram):
-    """Energy (d,) that each function adds to those before it, the rows' variance, and their energy."""
+    """Energy (d,) that each function adds to those before it, the rows' variance, and their
+    energy.
+    """
     # Orthonormal functions in the same order: the first b² span the first b bands for every b.
-    nested = scipy.linalg.solve_triangular(scipy.linalg.cholesky(gram, lower=True), functions, lower=True)
+    nested = scipy.linalg.solve_triangular(
+        scipy.linalg.cholesky(gram, lower=True), functions, lower=True
+    )
     nested = np.ascontiguousarray(nested.T, np.float32)
 
     def sums(chunk):
@@ -294,7 +340,9 @@ def _energies(rows, functions, gram):
 
 
 def check_harmonics(directions, components):
-    """Raise SettingsError where so many spherical harmonics cannot be had on a lattice; see `fit_harmonics`."""
+    """Raise SettingsError where so many spherical harmonics cannot be had on a lattice; see
+    `fit_harmonics`.
+    """
     if components is not None:
         _functions(directions, components)
 
@@ -306,22 +354,27 @@ def most_harmonics(directions, components):
 
 
 def _functions(directions, components=None):
-    """That many weighted functions (d, s) on a lattice, or as many as it tells apart, and their Gram matrix (d, d)."""
+    """That many weighted functions (d, s) on a lattice, or as many as it tells apart, and their
+    Gram matrix (d, d).
+    """
     bands = MAX_BANDS if components is None else _bands_of(components)
     functions = evaluate(directions.vectors, bands) * np.sqrt(directions.solid_angles)
     gram = functions @ functions.T
     usable = _told_apart(gram)
     if components is not None and bands > usable:
         raise SettingsError(
-            f"{components:,} spherical harmonics are above what {directions} tells apart: use at most "
-            f"{usable**2:,} ({usable} bands), or finer directions"
+            f"{components:,} spherical harmonics are above what {directions} tells apart: use at"
+            f" most {usable**2:,} ({usable} bands), or finer directions"
         )
     return functions[: usable**2], gram[: usable**2, : usable**2]
 
 
 def _told_apart(gram):
-    """Bands whose Gram matrix, a leading part of the one given, has no eigenvalue under `LEAST_EIGENVALUE`."""
-    # Where an eigenvalue is too small, a Cholesky factorization breaks off at the first leading minor that is not positive.
+    """Bands whose Gram matrix, a leading part of the one given, has no eigenvalue under
+    `LEAST_EIGENVALUE`.
+    """
+    # Where an eigenvalue is too small, a Cholesky factorization breaks off at the first leading
+    # minor that is not positive.
     _, minor = scipy.linalg.lapack.dpotrf(gram - LEAST_EIGENVALUE * np.eye(len(gram)))
     return isqrt(minor - 1 if minor > 0 else len(gram))
 
@@ -331,7 +384,7 @@ def _bands_of(components):
     if components == 0 or bands**2 != components or bands > MAX_BANDS:
         nearest = sorted({min(max(b, 1), MAX_BANDS) ** 2 for b in (bands, bands + 1)})
         raise SettingsError(
-            f"{components:,} spherical harmonics are not a whole number of bands from 1 to {MAX_BANDS}: "
-            f"use {' or '.join(f'{square:,}' for square in nearest)}"
+            f"{components:,} spherical harmonics are not a whole number of bands from 1 to"
+            f" {MAX_BANDS}: use {' or '.join(f'{square:,}' for square in nearest)}"
         )
     return bands

@@ -1,4 +1,6 @@
-"""Bases of one set of functions for all points: what principal components, spherical harmonics and shared wavelets have in common."""
+"""Bases of one set of functions for all points: what principal components, spherical harmonics and
+shared wavelets have in common.
+"""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,9 +14,10 @@ from .basis import Basis
 class LinearBasis(Basis):
     """A basis of d rows in the √w-weighted space, and a mean.
 
-    A transport row is T ≈ mean + (c · vectors)/√w with c = ((T − mean)·√w) · dualsᵀ. Under cell radiance L the
-    irradiance is then exactly c·ℓ + m with ℓ = (L√w)·vectorsᵀ and m = Σ_j w_j L_j mean_j; nothing of the mean is lost.
-    Functions may hold all three colour channels of transport, so that a point needs one set of coefficients for them.
+    A transport row is T ≈ mean + (c · vectors)/√w with c = ((T − mean)·√w) · dualsᵀ. Under cell
+    radiance L the irradiance is then exactly c·ℓ + m with ℓ = (L√w)·vectorsᵀ and m = Σ_j w_j L_j
+    mean_j; nothing of the mean is lost. Functions may hold all three colour channels of transport,
+    so that a point needs one set of coefficients for them.
 
     Parameters
     ----------
@@ -23,7 +26,8 @@ class LinearBasis(Basis):
     sqrt_weights : (s,) float32
         √w.
     captured_variance : (d,) float64
-        Energy of each component over the transport's variance. Where there is a mean these are shares of the variance.
+        Energy of each component over the transport's variance. Where there is a mean these are
+        shares of the variance.
     """
 
     vectors: np.ndarray
@@ -39,11 +43,15 @@ class LinearBasis(Basis):
 
     @property
     def duals(self):
-        """The rows (d, s) or (d, 3, s) whose products with a weighted row are its coefficients: `vectors` where they are orthonormal."""
+        """The rows (d, s) or (d, 3, s) whose products with a weighted row are its coefficients:
+        `vectors` where they are orthonormal.
+        """
         return self.vectors
 
     def encode(self, rows):
-        """Coefficients (b, d) float32 of transport rows (b, s), or (b, 3, s) if the functions hold three channels."""
+        """Coefficients (b, d) float32 of transport rows (b, s), or (b, 3, s) if the functions hold
+        three channels.
+        """
         weighted, mean_coefficients = self._encoder
         coefficients = (rows if self.mean.ndim == 1 else rows.reshape(len(rows), -1)) @ weighted
         coefficients -= mean_coefficients
@@ -51,18 +59,23 @@ class LinearBasis(Basis):
 
     @cached_property
     def _encoder(self):
-        """√w·dualsᵀ (s, d) or (3·s, d) and the mean's coefficients (d,): weights and mean then cost nothing per row."""
+        """√w·dualsᵀ (s, d) or (3·s, d) and the mean's coefficients (d,): weights and mean then cost
+        nothing per row.
+        """
         flat = (len(self), self.mean.size)
         weighted = (self.duals * self.sqrt_weights).reshape(flat)
         return weighted.T.copy(), self.duals.reshape(flat) @ (self.mean * self.sqrt_weights).ravel()
 
     def reconstruct(self, coefficients):
-        """Transport rows (b, s) float32 of coefficients (b, d); (b, 3, s) of coefficients (b, 3, d), or of functions of three channels."""
+        """Transport rows (b, s) float32 of coefficients (b, d); (b, 3, s) of coefficients (b, 3,
+        d), or of functions of three channels.
+        """
         return np.tensordot(coefficients, self.vectors, 1) / self.sqrt_weights + self.mean
 
     def at(self, coefficients, cells):
-        """Transport (b, k) float32 of points with coefficients (b, d) in some cells (b, k) of the lattice each; (b, k, 3) where it has
-        three channels."""
+        """Transport (b, k) float32 of points with coefficients (b, d) in some cells (b, k) of the
+        lattice each; (b, k, 3) where it has three channels.
+        """
         functions, mean = self._decoder
         if coefficients.ndim == 3:
             return np.einsum("bcd,bkd->bkc", coefficients, functions[cells])
@@ -70,7 +83,9 @@ class LinearBasis(Basis):
 
     @cached_property
     def _decoder(self):
-        """The functions (s, d) or (s, 3, d) that coefficients multiply in each cell, without weights, and the mean (s,) or (s, 3)."""
+        """The functions (s, d) or (s, 3, d) that coefficients multiply in each cell, without
+        weights, and the mean (s,) or (s, 3).
+        """
         return (self.vectors / self.sqrt_weights).T.copy(), self.mean.T.copy()
 
     def project_light(self, radiance):
@@ -92,5 +107,7 @@ class LinearBasis(Basis):
         mean = self.mean * self.sqrt_weights
         if self.mean.ndim == 1:
             return self.vectors @ weighted, mean @ weighted
-        light = np.stack([self.vectors[:, channel] @ weighted[:, channel] for channel in range(3)], axis=-1)
+        light = np.stack(
+            [self.vectors[:, channel] @ weighted[:, channel] for channel in range(3)], axis=-1
+        )
         return light, np.einsum("cs,sc->c", mean, weighted)

@@ -32,11 +32,15 @@ class NoBasis(Basis):
         return rows
 
     def reconstruct(self, coefficients):
-        """Transport rows (b, s) float32 of a `DirectTransport` of b points, or of the rows that `encode` gave."""
+        """Transport rows (b, s) float32 of a `DirectTransport` of b points, or of the rows that
+        `encode` gave.
+        """
         return np.asarray(coefficients, np.float32)
 
     def at(self, coefficients, cells):
-        """Transport (b, k) float32 of a `DirectTransport` of b points in some cells (b, k) of the lattice each."""
+        """Transport (b, k) float32 of a `DirectTransport` of b points in some cells (b, k) of the
+        lattice each.
+        """
         return coefficients.entries(cells)
 
     def project_light(self, radiance):

@@ -1,16 +1,20 @@
 """Principal components of transport (Eigentransport, section 3), fitted over blocks of rows.
 
-Rows are weighted by √w, the square root of each direction's solid angle, so that what is minimised is the L2 error
-over the sphere whatever the lattice (erratum 2 of the project's reading of the paper).
+Rows are weighted by √w, the square root of each direction's solid angle, so that what is minimised
+is the L2 error over the sphere whatever the lattice (erratum 2 of the project's reading of the
+paper).
 
 Two ways lead to them, and the cheaper one for the shape at hand is taken:
 
-- the Gram matrix of the smaller side, summed over blocks and decomposed in float64: exact to rounding;
-- block subspace iteration on the covariance, at first on a sample of the rows, and a Rayleigh-Ritz projection on the span
-  of its last two subspaces (a block Lanczos step). The variance that it reports is what its vectors do capture, and by
-  Halko, Martinsson and Tropp (2011, theorem 10.6 and corollary 10.10) the spectral error of such a subspace after q iterations
-  is in the mean at most (1 + √(d/(p − 1)) + e·√(d + p)/p · √(min(n, s) − d))^(1/(2q + 1)) times that of the best, with
-  oversampling p. Measured losses of captured variance are 1e-6 (docs/architecture.md).
+- the Gram matrix of the smaller side, summed over blocks and decomposed in float64: exact to
+  rounding;
+- block subspace iteration on the covariance, at first on a sample of the rows, and a Rayleigh-Ritz
+  projection on the span
+  of its last two subspaces (a block Lanczos step). The variance that it reports is what its vectors
+  do capture, and by Halko, Martinsson and Tropp (2011, theorem 10.6 and corollary 10.10) the
+  spectral error of such a subspace after q iterations is in the mean at most (1 + √(d/(p − 1)) +
+  e·√(d + p)/p · √(min(n, s) − d))^(1/(2q + 1)) times that of the best, with oversampling p.
+  Measured losses of captured variance are 1e-6 (docs/architecture.md).
 """
 
 import numpy as np
@@ -22,24 +26,33 @@ from .rows import Rows
 from .target import Fit, Target, check_room
 
 OVERSAMPLING = 16
-SAMPLE_ITERATIONS = 2  # power iterations on a quarter of the rows, which find nearly the subspace of all
+# power iterations on a quarter of the rows, which find nearly the subspace of all
+SAMPLE_ITERATIONS = 2
 ITERATIONS = 2  # power iterations on all rows, before the final projection
-RANK_TOLERANCE = 100 * float(np.finfo(np.float32).eps) ** 2  # of squared singular values, against the sum of squares
+# of squared singular values, against the sum of squares
+RANK_TOLERANCE = 100 * float(np.finfo(np.float32).eps) ** 2
 FIRST_COMPONENTS = 64  # where a search for a share of the variance starts
 MARGIN = 1.1  # above what that search expects to need
 
-# Seconds on two cores, of which only the ratios matter: for each element of a row and column of the subspace, for each element
-# of a row, for each product of the Gram matrix, and for each s³ of its decomposition.
+# Seconds on two cores, of which only the ratios matter: for each element of a row and column of the
+# subspace, for each element of a row, for each product of the Gram matrix, and for each s³ of its
+# decomposition.
 ITERATION_COST, ROW_COST, GRAM_COST, DECOMPOSITION_COST = 1.3e-10, 4e-9, 2e-11, 6e-11
-GRAM_BYTES = 40  # for each entry of a Gram matrix: the sum, parts of it that some threads have ready, the decomposition
+# for each entry of a Gram matrix: the sum, parts of it that some threads have ready, the
+# decomposition
+GRAM_BYTES = 40
 GRAM_ROWS = 1024  # rows of one product: fewer would pass over the Gram matrix too often
 NEGLIGIBLE = 0.5  # seconds that exactness is worth
 MOST_GRAM_BYTES = 1 << 29  # a larger Gram matrix is no choice, only where there is no other
-ITERATION_BYTES = 110  # for each direction and column of the subspace: sums of some threads in float64, and the orthonormalization
+# for each direction and column of the subspace: sums of some threads in float64, and the
+# orthonormalization
+ITERATION_BYTES = 110
 
 
 class PCA(LinearBasis):
-    """Eigentransport: the orthonormal components that capture the most variance of a scene's own transport."""
+    """Eigentransport: the orthonormal components that capture the most variance of a scene's own
+    transport.
+    """
 
     kind = "pca"
 
@@ -79,7 +92,8 @@ def fit_pca(
     max_bytes : float
         Memory that the fit may take.
     keep : callable(name, compute) returning an array
-        Called for what each pass over the rows gives, so that a caller may store and restore it; `name` tells the pass.
+        Called for what each pass over the rows gives, so that a caller may store and restore it;
+        `name` tells the pass.
 
     Returns
     -------
@@ -149,7 +163,9 @@ def _plan(n, s, components):
     iteration = n * s * (subspace * ITERATION_COST + ROW_COST)
     gram = n * s * side * GRAM_COST + side**3 * DECOMPOSITION_COST
     # Subspaces that together reach a large part of the space are no smaller problem than the whole.
-    exact = 2 * subspace > side or (gram_bytes <= MOST_GRAM_BYTES and gram <= max(iteration, NEGLIGIBLE))
+    exact = 2 * subspace > side or (
+        gram_bytes <= MOST_GRAM_BYTES and gram <= max(iteration, NEGLIGIBLE)
+    )
     return exact, gram_bytes if exact else iteration_bytes
 
 
@@ -158,7 +174,9 @@ def _subspace(components):
 
 
 def _leading(rows, mean, components, start, seed, progress, keep, max_bytes):
-    """Leading squared singular values, descending, and right singular vectors (s, components) of the centred, weighted rows."""
+    """Leading squared singular values, descending, and right singular vectors (s, components) of
+    the centred, weighted rows.
+    """
     exact, needed = _plan(*rows.shape, components)
     check_room(f"fitting {components:,} components", needed, max_bytes)
     if exact:
@@ -167,7 +185,9 @@ def _leading(rows, mean, components, start, seed, progress, keep, max_bytes):
 
 
 def _subspace_iteration(rows, mean, components, start, seed, progress, keep):
-    """`start` (s, k) are vectors of an earlier fit with fewer components: what they span need not be found again."""
+    """`start` (s, k) are vectors of an earlier fit with fewer components: what they span need not
+    be found again.
+    """
     subspace = _subspace(components)
     random = np.random.default_rng(seed)
     basis = random.standard_normal((len(mean), subspace)).astype(np.float32)
@@ -184,7 +204,12 @@ def _subspace_iteration(rows, mean, components, start, seed, progress, keep):
     span = _orthonormal(np.concatenate([before, basis], axis=1))
 
     def gram(chunk):
-        return (sum((narrow.T @ narrow).astype(np.float64) for _, narrow in _narrow(rows, chunk, mean, span)),)
+        return (
+            sum(
+                (narrow.T @ narrow).astype(np.float64)
+                for _, narrow in _narrow(rows, chunk, mean, span)
+            ),
+        )
 
     (ritz,) = rows.sums(gram)
     progress(len(passes) + 1, len(passes) + 1)
@@ -215,7 +240,9 @@ def _orthonormal(vectors):
 
 
 def _narrow(rows, index, mean, basis):
-    """Blocks of rows and their product X·basis; weights and mean are applied to the narrow side only."""
+    """Blocks of rows and their product X·basis; weights and mean are applied to the narrow side
+    only.
+    """
     weighted = basis * rows.sqrt_weights[:, None]
     centre = (mean @ basis).astype(np.float32)
     for block in rows.blocks(index):
@@ -232,7 +259,12 @@ def _exact(rows, mean, components, progress):
     chunks = np.array_split(rows.index, -(-n // GRAM_ROWS))
 
     def centred(chunk):
-        return np.concatenate([block * rows.sqrt_weights for block in rows.blocks(chunk)]).astype(np.float64) - mean
+        return (
+            np.concatenate([block * rows.sqrt_weights for block in rows.blocks(chunk)]).astype(
+                np.float64
+            )
+            - mean
+        )
 
     def reported(parts):
         for done, part in enumerate(parts, start=1):
@@ -247,7 +279,9 @@ def _exact(rows, mean, components, progress):
             values, vectors = scipy.linalg.eigh(gram, subset_by_index=keep, overwrite_a=True)
         return np.maximum(values[::-1], 0), vectors[:, ::-1]
     matrix = np.concatenate(list(reported(map_chunks(centred, chunks))))
-    gram = np.concatenate(list(map_chunks(lambda part: part @ matrix.T, np.array_split(matrix, len(chunks)))))
+    gram = np.concatenate(
+        list(map_chunks(lambda part: part @ matrix.T, np.array_split(matrix, len(chunks))))
+    )
     with one_blas_thread():
         values, left = scipy.linalg.eigh(gram, subset_by_index=keep, overwrite_a=True)
         values, left = np.maximum(values[::-1], 0), left[:, ::-1]

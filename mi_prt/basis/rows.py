@@ -7,7 +7,9 @@ import numpy as np
 
 from ..system.parallel import BLOCK_ROWS, map_chunks
 
-CHUNKS = 16  # parts that the rows are split into for the threads; fixed, so that sums do not depend on their number
+# parts that the rows are split into for the threads; fixed, so that sums do not depend on their
+# number
+CHUNKS = 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +31,9 @@ class Rows:
     directions: object
 
     def __post_init__(self):
-        object.__setattr__(self, "sqrt_weights", np.sqrt(self.directions.solid_angles).astype(np.float32))
+        object.__setattr__(
+            self, "sqrt_weights", np.sqrt(self.directions.solid_angles).astype(np.float32)
+        )
 
     @property
     def shape(self):
@@ -43,10 +47,11 @@ class Rows:
             yield self.read(index[first : first + BLOCK_ROWS])
 
     def sums(self, function, index=None):
-        """Sum over chunks of rows of what `function(chunk of the index)` returns, a tuple of arrays or numbers.
+        """Sum over chunks of rows of what `function(chunk of the index)` returns, a tuple of arrays
+        or numbers.
 
-        The chunks run on all threads. They are the same for any number of threads and are summed in order, so that results
-        are too.
+        The chunks run on all threads. They are the same for any number of threads and are summed in
+        order, so that results are too.
         """
         index = self.index if index is None else index
         total = None

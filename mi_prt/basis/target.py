@@ -7,7 +7,8 @@ import numpy as np
 
 from ..errors import SettingsError
 
-ROUNDING = 1e-6  # share of Σ‖T‖² below which a difference of sums of squares of float32 rows is their rounding
+# share of Σ‖T‖² below which a difference of sums of squares of float32 rows is their rounding
+ROUNDING = 1e-6
 
 
 @dataclass(frozen=True)
@@ -33,17 +34,23 @@ class Target:
     def __post_init__(self):
         if (self.components is None) == (self.variance is None):
             raise SettingsError(
-                f"a basis takes either a number of components or a share of the variance, got components "
-                f"{self.components!r} and variance {self.variance!r}: set exactly one"
+                "a basis takes either a number of components or a share of the variance, got"
+                f" components {self.components!r} and variance {self.variance!r}: set exactly one"
             )
         components, variance = self.components, self.variance
-        if variance is None and (isinstance(components, bool) or not isinstance(components, Integral) or components < 0):
+        if variance is None and (
+            isinstance(components, bool) or not isinstance(components, Integral) or components < 0
+        ):
             raise SettingsError(f"components must be an integer ≥ 0, got {components!r}")
         if components is None and not (isinstance(variance, Real) and 0 < variance < 1):
-            raise SettingsError(f"the share of the variance must be above 0 and below 1, got {variance!r}: try 0.99")
+            raise SettingsError(
+                f"the share of the variance must be above 0 and below 1, got {variance!r}: try 0.99"
+            )
 
     def allowed_residual(self, variance, energy):
-        """Largest Σ‖T − T̂‖² that captures the share of the variance; where nothing varies, what rounding leaves."""
+        """Largest Σ‖T − T̂‖² that captures the share of the variance; where nothing varies, what
+        rounding leaves.
+        """
         return (1 - self.variance) * variance if variance > ROUNDING * energy else ROUNDING * energy
 
 
@@ -69,8 +76,9 @@ class Fit:
 
     @property
     def captured_variance(self):
-        """1 − Σ‖T − T̂‖²/Σ‖T − mean‖². Negative where a basis without a mean does worse than the mean alone. Where nothing varies: 1 if
-        nothing is lost, else 0."""
+        """1 − Σ‖T − T̂‖²/Σ‖T − mean‖². Negative where a basis without a mean does worse than the
+        mean alone. Where nothing varies: 1 if nothing is lost, else 0.
+        """
         if self.variance > ROUNDING * self.energy:
             return float(1 - self.residual / self.variance)
         return float(self.residual <= ROUNDING * self.energy)
@@ -82,7 +90,9 @@ class Fit:
 
 
 def centred(energy, total, count):
-    """Σ‖T − mean‖² from Σ‖T‖² and ΣT (s,), both weighted, of some rows; 0 where it is no more than rounding."""
+    """Σ‖T − mean‖² from Σ‖T‖² and ΣT (s,), both weighted, of some rows; 0 where it is no more than
+    rounding.
+    """
     variance = energy - float(total @ total) / max(count, 1)
     return variance if variance > ROUNDING * energy else 0.0
 
@@ -96,6 +106,7 @@ def check_room(what, needed, room):
     """Raise SettingsError where something needs more bytes than there is room for."""
     if needed > room:
         raise SettingsError(
-            f"{what} needs {needed / 1e6:,.0f} MB, and of max_memory (--max-memory) {max(room, 0) / 1e6:,.0f} MB are left: raise it, "
-            "or use fewer coefficients or directions"
+            f"{what} needs {needed / 1e6:,.0f} MB, and of max_memory (--max-memory)"
+            f" {max(room, 0) / 1e6:,.0f} MB are left: raise it, or use fewer coefficients or"
+            " directions"
         )

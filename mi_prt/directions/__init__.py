@@ -6,4 +6,11 @@ from .latlong import LatLong
 from .lattice import MAX_CUBEMAP_RESOLUTION, DirectionLattice
 from .parse import parse_directions
 
-__all__ = ["MAX_CUBEMAP_RESOLUTION", "Cubemap", "DirectionLattice", "Halton", "LatLong", "parse_directions"]
+__all__ = [
+    "MAX_CUBEMAP_RESOLUTION",
+    "Cubemap",
+    "DirectionLattice",
+    "Halton",
+    "LatLong",
+    "parse_directions",
+]

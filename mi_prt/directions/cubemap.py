@@ -8,8 +8,9 @@ import numpy as np
 from ..errors import SettingsError
 from .lattice import MAX_CUBEMAP_RESOLUTION, DirectionLattice, is_integer_in, near_square
 
-# Frame of each cube face: its rows are the axes of the face coordinates (a, b) and the outward normal. The faces −x, −y, −z
-# are the point reflections of +x, +y, +z, so that cell j + s/2 is the antipode of cell j.
+# Frame of each cube face: its rows are the axes of the face coordinates (a, b) and the outward
+# normal. The faces −x, −y, −z are the point reflections of +x, +y, +z, so that cell j + s/2 is the
+# antipode of cell j.
 _POSITIVE_FACES = np.array(
     [
         [[0, 0, -1], [0, 1, 0], [1, 0, 0]],  # +x
@@ -25,9 +26,10 @@ _FACES = np.concatenate([_POSITIVE_FACES, -_POSITIVE_FACES])
 class Cubemap(DirectionLattice):
     """Equi-angular cubemap lattice with 6·N·N cells.
 
-    The cells of a face are equally wide in angle, not in the face's plane, so that the solid angles of one
-    map differ by at most √2 instead of 5.2 and the resolution is the same in the middle of a face and at its
-    corners. Cell index: (face·N + row)·N + column, faces in the order +x, +y, +z, −x, −y, −z.
+    The cells of a face are equally wide in angle, not in the face's plane, so that the solid angles
+    of one map differ by at most √2 instead of 5.2 and the resolution is the same in the middle of a
+    face and at its corners. Cell index: (face·N + row)·N + column, faces in the order +x, +y, +z,
+    −x, −y, −z.
 
     Parameters
     ----------
@@ -45,7 +47,8 @@ class Cubemap(DirectionLattice):
     def __post_init__(self):
         if not is_integer_in(self.resolution, 1, MAX_CUBEMAP_RESOLUTION):
             raise SettingsError(
-                f"cubemap resolution {self.resolution} is outside 1…{MAX_CUBEMAP_RESOLUTION}: use for example cubemap:32"
+                f"cubemap resolution {self.resolution} is outside 1…{MAX_CUBEMAP_RESOLUTION}: use"
+                " for example cubemap:32"
             )
 
     def __str__(self):
@@ -60,7 +63,9 @@ class Cubemap(DirectionLattice):
         return _cell_solid_angles(self.resolution, self.resolution).ravel()
 
     def subdivided(self, rays):
-        """Equi-angular sub-cells, as square as their number allows; see `DirectionLattice.subdivided`."""
+        """Equi-angular sub-cells, as square as their number allows; see
+        `DirectionLattice.subdivided`.
+        """
         rows, columns = near_square(rays)
         n = self.resolution
         a = np.tan(np.pi / 4 * _centres(n * columns))
@@ -86,7 +91,8 @@ class Cubemap(DirectionLattice):
         on_y = ~on_x & (ay >= az)
         major = np.where(on_x, x, np.where(on_y, y, z))
         scale = 1 / major
-        # Coordinates in the frames of _FACES; the sign of the major axis reflects them on the negative faces.
+        # Coordinates in the frames of _FACES; the sign of the major axis reflects them on the
+        # negative faces.
         z_scaled = -z * scale
         a = np.where(on_x, z_scaled, x * scale)
         b = np.where(on_y, z_scaled, y * scale)
@@ -106,7 +112,9 @@ def _centres(n):
 
 
 def _cell_solid_angles(rows, columns):
-    """Exact solid angles (6, rows, columns) of equi-angular cells, from the solid angle of a rectangle at its corner."""
+    """Exact solid angles (6, rows, columns) of equi-angular cells, from the solid angle of a
+    rectangle at its corner.
+    """
     a = np.tan(np.pi / 4 * np.linspace(-1, 1, columns + 1))
     b = np.tan(np.pi / 4 * np.linspace(-1, 1, rows + 1))[:, None]
     corner = np.arctan2(a * b, np.sqrt(a * a + b * b + 1))

@@ -18,9 +18,10 @@ TABLE_REFINEMENT = 16  # table cells along the side of a cell: a quarter of them
 class Halton(DirectionLattice):
     """Halton lattice of s directions, each in the cell of what is nearer to it than to any other.
 
-    The first half are the points 1…s/2 of the Halton sequence in the bases 2 and 3, brought to the upper hemisphere with
-    equal areas: y is the first coordinate, and the second the azimuth φ/2π in (sin φ · √(1 − y²), y, −cos φ · √(1 − y²)).
-    The second half are their antipodes. Cells are spherical Voronoi cells, exact, and may differ tenfold in solid angle.
+    The first half are the points 1…s/2 of the Halton sequence in the bases 2 and 3, brought to the
+    upper hemisphere with equal areas: y is the first coordinate, and the second the azimuth φ/2π in
+    (sin φ · √(1 − y²), y, −cos φ · √(1 − y²)). The second half are their antipodes. Cells are
+    spherical Voronoi cells, exact, and may differ tenfold in solid angle.
 
     Parameters
     ----------
@@ -38,8 +39,8 @@ class Halton(DirectionLattice):
     def __post_init__(self):
         if not is_integer_in(self.count, MIN_HALTON_COUNT, MAX_HALTON_COUNT) or self.count % 2:
             raise SettingsError(
-                f"halton count {self.count} must be an even number in {MIN_HALTON_COUNT}…{MAX_HALTON_COUNT:,}: "
-                "use for example halton:6144"
+                f"halton count {self.count} must be an even number in"
+                f" {MIN_HALTON_COUNT}…{MAX_HALTON_COUNT:,}: use for example halton:6144"
             )
 
     def __str__(self):
@@ -57,12 +58,17 @@ class Halton(DirectionLattice):
     def subdivided(self, rays):
         """Sub-cells of equal solid angle; see `DirectionLattice.subdivided`.
 
-        A square grid, as square as the number allows, is brought to the disc by the concentric map of Shirley and Chiu
-        (1997), and the disc to each cell along rays from its direction. Both maps keep shares of area.
+        A square grid, as square as the number allows, is brought to the disc by the concentric map
+        of Shirley and Chiu (1997), and the disc to each cell along rays from its direction. Both
+        maps keep shares of area.
         """
         rows, columns = near_square(rays)
-        x, y = np.meshgrid((2 * np.arange(columns) + 1) / columns - 1, (2 * np.arange(rows) + 1) / rows - 1)
-        half = np.stack([self._at(*place) for place in zip(*_concentric(x.ravel(), y.ravel()))], axis=1).astype(np.float32)
+        x, y = np.meshgrid(
+            (2 * np.arange(columns) + 1) / columns - 1, (2 * np.arange(rows) + 1) / rows - 1
+        )
+        half = np.stack(
+            [self._at(*place) for place in zip(*_concentric(x.ravel(), y.ravel()))], axis=1
+        ).astype(np.float32)
         return np.concatenate([half, -half]), np.full((self.count, rays), 1 / rays, np.float32)
 
     def cells(self, vectors):
@@ -97,18 +103,22 @@ class Halton(DirectionLattice):
         voronoi.sort_vertices_of_regions()
         regions = voronoi.regions[: len(half)]
         count = max(map(len, regions)) + 1
-        corners = voronoi.vertices[[region + region[:1] * (count - len(region)) for region in regions]]
+        corners = voronoi.vertices[
+            [region + region[:1] * (count - len(region)) for region in regions]
+        ]
         centre, a, b = half[:, None], corners[:, :-1], corners[:, 1:]
         # Solid angle of a triangle (Van Oosterom and Strackee, 1983).
-        triangles = 2 * np.arctan2(np.abs(_dot(centre, np.cross(a, b))), 1 + _dot(centre, a) + _dot(a, b) + _dot(b, centre))
+        triangles = 2 * np.arctan2(
+            np.abs(_dot(centre, np.cross(a, b))), 1 + _dot(centre, a) + _dot(a, b) + _dot(b, centre)
+        )
         return corners, np.cumsum(triangles, axis=1)
 
     def _at(self, turn, share):
-        """The direction in each cell of the first half at a share (0…1) of the cell's solid angle about its own direction
-        and at a share of it outwards; (s/2, 3) float64.
+        """The direction in each cell of the first half at a share (0…1) of the cell's solid angle
+        about its own direction and at a share of it outwards; (s/2, 3) float64.
 
-        The border is reached where the fan's solid angle says, the place on the way there where the cap's does (Arvo 1995,
-        Stratified sampling of spherical triangles).
+        The border is reached where the fan's solid angle says, the place on the way there where the
+        cap's does (Arvo 1995, Stratified sampling of spherical triangles).
         """
         centre, (corners, ends) = self._directions, self._fans
         cell, target = np.arange(len(centre)), turn * ends[:, -1]
@@ -116,10 +126,13 @@ class Halton(DirectionLattice):
         before = np.where(triangle > 0, ends[cell, triangle - 1], 0)
         a, b = corners[cell, triangle], corners[cell, triangle + 1]
         along = unit(b - a * _dot(a, b)[:, None])
-        # The triangle (centre, a, border) has the solid angle target − before; solved for the arc from a to the border.
+        # The triangle (centre, a, border) has the solid angle target − before; solved for the arc
+        # from a to the border.
         tangent = np.tan((target - before) / 2)
         volume = np.abs(_dot(centre, np.cross(a, along)))
-        arc = 2 * np.arctan(tangent * (1 + _dot(centre, a)) / (volume - tangent * _dot(centre, along)))
+        arc = 2 * np.arctan(
+            tangent * (1 + _dot(centre, a)) / (volume - tangent * _dot(centre, along))
+        )
         border = a * np.cos(arc)[:, None] + along * np.sin(arc)[:, None]
         reach = _dot(centre, border)
         cosine = (1 - share * (1 - reach))[:, None]
@@ -127,12 +140,15 @@ class Halton(DirectionLattice):
 
     @cached_property
     def _table(self):
-        """A fine cubemap, and which cell each of its cells lies in; −1 where a border may cross it."""
+        """A fine cubemap, and which cell each of its cells lies in; −1 where a border may cross
+        it.
+        """
         fine = self.refined(TABLE_REFINEMENT)
         half = len(fine) // 2
         chords, nearest = self._tree.query(fine.vectors[:half], 2, workers=-1)
         nearer, next_near = 2 * np.arcsin(chords.T / 2)
-        # No direction of a fine cell is farther from its centre than √(8/3) times half its side, at the cube's corners.
+        # No direction of a fine cell is farther from its centre than √(8/3) times half its side, at
+        # the cube's corners.
         reach = np.pi / 4 / fine.resolution * (8 / 3) ** 0.5 + 1e-6  # and what float32 may err
         first = np.where(next_near - nearer > 2 * reach, nearest[:, 0], -1)
         second = np.where(first < 0, -1, (first + self.count // 2) % self.count)
@@ -149,7 +165,9 @@ def _radical_inverse(index, base):
 
 
 def _concentric(x, y):
-    """Shares (of the turn, of the area) on a disc of points of the square [−1, 1]², by the concentric map."""
+    """Shares (of the turn, of the area) on a disc of points of the square [−1, 1]², by the
+    concentric map.
+    """
     wide = np.abs(x) >= np.abs(y)
     longer = np.where(wide, x, y)
     slope = np.divide(np.where(wide, y, x), longer, out=np.zeros(len(x)), where=longer != 0)

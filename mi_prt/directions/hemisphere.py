@@ -1,8 +1,9 @@
 """Directions over a hemisphere, on a grid that is looked up in closed form.
 
-The unit square is mapped to the disk by Shirley and Chiu's concentric map and from there to the hemisphere, both with equal area: the
-cells of a grid have equal solid angles, neighbours in the grid are neighbours on the hemisphere, and the four directions around any
-other one are found without a search.
+The unit square is mapped to the disk by Shirley and Chiu's concentric map and from there to the
+hemisphere, both with equal area: the cells of a grid have equal solid angles, neighbours in the
+grid are neighbours on the hemisphere, and the four directions around any other one are found
+without a search.
 """
 
 import numpy as np
@@ -40,21 +41,27 @@ class Hemisphere:
     def __init__(self, count):
         sides = _sides(count) if LEAST <= count <= MOST else None
         if sides is None:
-            fitting = sorted((c for c in range(LEAST, MOST + 1) if _sides(c)), key=lambda c: abs(c - count))[:2]
+            fitting = sorted(
+                (c for c in range(LEAST, MOST + 1) if _sides(c)), key=lambda c: abs(c - count)
+            )[:2]
             raise SettingsError(
-                f"{count} depth directions make no grid with sides of about the same length: take {' or '.join(map(str, sorted(fitting)))}"
+                f"{count} depth directions make no grid with sides of about the same length: take"
+                f" {' or '.join(map(str, sorted(fitting)))}"
             )
         self.rows, self.columns = sides
         j, i = np.indices(sides).reshape(2, -1)
         x, y = (i + 0.5) / self.columns, (j + 0.5) / self.rows
         self.vectors = _to_hemisphere(x, y).astype(np.float32)
-        self.weights = (self.vectors[:, 2] / self.vectors[:, 2].sum(dtype=np.float64)).astype(np.float32)
+        self.weights = (self.vectors[:, 2] / self.vectors[:, 2].sum(dtype=np.float64)).astype(
+            np.float32
+        )
 
     def __len__(self):
         return len(self.vectors)
 
     def around(self, direction):
-        """The four directions around others, and their shares in bilinear interpolation on the grid.
+        """The four directions around others, and their shares in bilinear interpolation on the
+        grid.
 
         Parameters
         ----------
@@ -72,7 +79,9 @@ class Hemisphere:
         # To the disk with equal area, r² = 1 − cos θ, and from there to the square.
         z = dr.clip(direction.z, 0, 1)
         scale = dr.sqrt(1 / (1 + z))
-        square = mi.warp.uniform_disk_to_square_concentric(mi.Point2f(direction.x * scale, direction.y * scale))
+        square = mi.warp.uniform_disk_to_square_concentric(
+            mi.Point2f(direction.x * scale, direction.y * scale)
+        )
         x = dr.clip(square.x * self.columns - 0.5, 0, self.columns - 1)
         y = dr.clip(square.y * self.rows - 0.5, 0, self.rows - 1)
         i, j = dr.minimum(mi.UInt32(x), self.columns - 2), dr.minimum(mi.UInt32(y), self.rows - 2)
@@ -85,14 +94,16 @@ class Hemisphere:
 
 
 def frames(normals, reference):
-    """Rotations (n, 3, 3) whose third columns are normals (n, 3), each turned the shortest way from one frame (3, 3).
+    """Rotations (n, 3, 3) whose third columns are normals (n, 3), each turned the shortest way from
+    one frame (3, 3).
 
     Directions of neighbouring points on a surface are then as parallel as they can be.
     """
     reference, normals = np.asarray(reference, np.float64), np.asarray(normals, np.float64)
     normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
     z = reference[:, 2] / np.linalg.norm(reference[:, 2])
-    # A half turn about z and one about the middle between z and the normal together take z to the normal the shortest way.
+    # A half turn about z and one about the middle between z and the normal together take z to the
+    # normal the shortest way.
     middle = normals + z
     length = np.linalg.norm(middle, axis=1, keepdims=True)
     opposite = length[:, 0] < _OPPOSITE

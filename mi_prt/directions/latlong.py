@@ -11,14 +11,17 @@ from .lattice import MAX_DIRECTIONS, DirectionLattice, is_integer_in, near_squar
 
 @dataclass(frozen=True)
 class LatLong(DirectionLattice):
-    """Latitude-longitude lattice with W·H cells, equally wide in either angle, in the convention of Mitsuba's `envmap`.
+    """Latitude-longitude lattice with W·H cells, equally wide in either angle, in the convention of
+    Mitsuba's `envmap`.
 
-    +y is up, and the point (u, v) of the map looks along (sin 2πu · sin πv, cos πv, −cos 2πu · sin πv); the cell in row i
-    and column j reaches from (j/W, i/H) to ((j+1)/W, (i+1)/H), and its direction is that of the middle of the two. (The
-    direction that halves the cell's solid angle would make integrals over the sphere twice as wrong.)
+    +y is up, and the point (u, v) of the map looks along (sin 2πu · sin πv, cos πv, −cos 2πu · sin
+    πv); the cell in row i and column j reaches from (j/W, i/H) to ((j+1)/W, (i+1)/H), and its
+    direction is that of the middle of the two. (The direction that halves the cell's solid angle
+    would make integrals over the sphere twice as wrong.)
 
-    Cell index: the upper hemisphere in rows, i·W + j with i < H/2, from the pole down; then the antipodes of these cells in
-    the same order, so that W·H/2 + i·W + j is the cell in row H − 1 − i and column (j + W/2) mod W.
+    Cell index: the upper hemisphere in rows, i·W + j with i < H/2, from the pole down; then the
+    antipodes of these cells in the same order, so that W·H/2 + i·W + j is the cell in row H − 1 − i
+    and column (j + W/2) mod W.
 
     Parameters
     ----------
@@ -38,10 +41,13 @@ class LatLong(DirectionLattice):
 
     def __post_init__(self):
         sides = (self.width, self.height)
-        if not all(is_integer_in(side, 2, MAX_DIRECTIONS) and side % 2 == 0 for side in sides) or len(self) > MAX_DIRECTIONS:
+        if (
+            not all(is_integer_in(side, 2, MAX_DIRECTIONS) and side % 2 == 0 for side in sides)
+            or len(self) > MAX_DIRECTIONS
+        ):
             raise SettingsError(
-                f"latlong size {self.width}x{self.height} must be two even numbers ≥ 2 of a product of at most "
-                f"{MAX_DIRECTIONS:,}: use for example latlong:128x64"
+                f"latlong size {self.width}x{self.height} must be two even numbers ≥ 2 of a product"
+                f" of at most {MAX_DIRECTIONS:,}: use for example latlong:128x64"
             )
 
     def __str__(self):
@@ -57,7 +63,8 @@ class LatLong(DirectionLattice):
 
     def subdivided(self, rays):
         """Sub-cells equally wide in either angle; see `DirectionLattice.subdivided`."""
-        columns, rows = near_square(rays)  # towards the poles cells are narrow: the larger factor goes along the meridian
+        # towards the poles cells are narrow: the larger factor goes along the meridian
+        columns, rows = near_square(rays)
         shape = (self.height // 2, self.width, rows, columns)
         theta = (np.arange(self.height // 2 * rows) + 0.5) * (np.pi / (self.height * rows))
         phi = (np.arange(self.width * columns) + 0.5) * (2 * np.pi / (self.width * columns))
@@ -85,6 +92,8 @@ class LatLong(DirectionLattice):
 
 
 def _bands(height):
-    """cos θ₀ − cos θ₁ of the upper half of `height` equally high bands, without cancellation at the pole."""
+    """cos θ₀ − cos θ₁ of the upper half of `height` equally high bands, without cancellation at the
+    pole.
+    """
     middle = (np.arange(height // 2) + 0.5) * (np.pi / height)
     return 2 * np.sin(middle) * np.sin(np.pi / height / 2)

@@ -10,16 +10,18 @@ from scipy.spatial import cKDTree
 from ..errors import SettingsError
 
 MAX_CUBEMAP_RESOLUTION = 512
-MAX_DIRECTIONS = 6 * MAX_CUBEMAP_RESOLUTION**2  # 1.6 million: beyond any transport matrix this program could hold
+# 1.6 million: beyond any transport matrix this program could hold
+MAX_DIRECTIONS = 6 * MAX_CUBEMAP_RESOLUTION**2
 
 
 class DirectionLattice(ABC):
     """s unit vectors, each in a cell of its own; the cells partition the sphere.
 
-    Lattices are frozen and hashable, and equal where their settings are. `parse_directions(str(lattice))` gives the same
-    lattice, and `len(lattice)` is s. Every lattice is symmetric about the origin: direction j + s/2 is exactly the opposite
-    of direction j, its cell the point reflection of cell j, and ray r of `subdivided` the opposite of ray r there. Transport
-    keeps one bit for such a pair.
+    Lattices are frozen and hashable, and equal where their settings are.
+    `parse_directions(str(lattice))` gives the same lattice, and `len(lattice)` is s. Every lattice
+    is symmetric about the origin: direction j + s/2 is exactly the opposite of direction j, its
+    cell the point reflection of cell j, and ray r of `subdivided` the opposite of ray r there.
+    Transport keeps one bit for such a pair.
     """
 
     @abstractmethod
@@ -75,9 +77,10 @@ class DirectionLattice(ABC):
     def nearest(self, vectors, k):
         """The directions nearest by angle, nearest first (Eigentransport, section 4.2.1).
 
-        One alone is that of the cell, in closed form; more go by their angles. That differs along the borders of a cubemap's
-        cells, which are sheared at the cube's corners: there another direction is the nearest to 5 % of all directions, on
-        average by 6 % of a cell's side. Of a latitude-longitude map it differs for 0.3 % and less, of Halton cells never.
+        One alone is that of the cell, in closed form; more go by their angles. That differs along
+        the borders of a cubemap's cells, which are sheared at the cube's corners: there another
+        direction is the nearest to 5 % of all directions, on average by 6 % of a cell's side. Of a
+        latitude-longitude map it differs for 0.3 % and less, of Halton cells never.
 
         Parameters
         ----------
@@ -96,13 +99,16 @@ class DirectionLattice(ABC):
             If k is outside 1…s.
         """
         if not is_integer_in(k, 1, len(self)):
-            raise SettingsError(f"the number of nearest directions must be 1…{len(self)} for {self}, got {k}")
+            raise SettingsError(
+                f"the number of nearest directions must be 1…{len(self)} for {self}, got {k}"
+            )
         if k == 1:
             return self.cells(vectors)[:, None]
         return self._tree.query(unit(vectors), k, workers=-1)[1]
 
     def refined(self, factor):
-        """A cubemap whose cells are about `factor` times finer along their sides than this lattice's.
+        """A cubemap whose cells are about `factor` times finer along their sides than this
+        lattice's.
 
         Parameters
         ----------
@@ -138,7 +144,11 @@ def near_square(rays):
 
 def is_integer_in(value, least, most):
     """Whether a value is an integer of Python or NumPy (and no bool) in least…most."""
-    return isinstance(value, int | np.integer) and not isinstance(value, bool) and least <= value <= most
+    return (
+        isinstance(value, int | np.integer)
+        and not isinstance(value, bool)
+        and least <= value <= most
+    )
 
 
 def unit(vectors):

@@ -40,6 +40,6 @@ def parse_directions(text):
         if match := re.fullmatch(form, str(text)):
             return lattice(*map(int, match.groups()))
     raise SettingsError(
-        f"directions {reprlib.repr(str(text))} are not known: use cubemap:N, latlong:WxH or halton:N, "
-        "for example cubemap:32, latlong:128x64 or halton:6144"
+        f"directions {reprlib.repr(str(text))} are not known: use cubemap:N, latlong:WxH or"
+        " halton:N, for example cubemap:32, latlong:128x64 or halton:6144"
     )

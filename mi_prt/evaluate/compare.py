@@ -1,4 +1,6 @@
-"""An asset against Mitsuba's ground truth, at the points and in the image, with the error explained."""
+"""An asset against Mitsuba's ground truth, at the points and in the image, with the error
+explained.
+"""
 
 import time
 from collections.abc import Callable
@@ -7,15 +9,14 @@ from pathlib import Path
 
 import numpy as np
 
+from ..asset.meshless_asset import MeshlessAsset
+from ..asset.provenance import open_scene_of
 from ..errors import SettingsError
 from ..lighting.emission import emission_of
 from ..lighting.scene_light import chosen_local_light, lit_scene, turned_light
-from ..asset.meshless_asset import MeshlessAsset
-from ..asset.provenance import open_scene_of
 from ..render.display import display, exposure
 from ..render.image import coverage, pick_sensor, render_image, resized
-from . import ground_truth
-from . import metrics
+from . import ground_truth, metrics
 from .local_lights import measure_error
 from .report import write_report
 
@@ -23,7 +24,8 @@ REFERENCES = ("modelled", "full")
 COMPARED_POINTS = 4096
 POINT_SAMPLES = 4096  # samples of the emitters at each compared point
 POINT_PATHS = 1024  # paths from each compared point, where light is reflected
-IMAGE_SAMPLES = 64  # samples per pixel of the asset's own image: it has no noise but that of antialiasing
+# samples per pixel of the asset's own image: it has no noise but that of antialiasing
+IMAGE_SAMPLES = 64
 
 
 def compare(
@@ -49,7 +51,8 @@ def compare(
     folder : path
         Gets report.json, index.html, EXRs and PNGs; created if need be.
     light : what `as_light` accepts, or a list of such and 'scene', optional
-        By default 'scene': the scene's own distant light, or its local light if the asset is one of local lights.
+        By default 'scene': the scene's own distant light, or its local light if the asset is one of
+        local lights.
     rotate : (axis, degrees), optional
         Turns the distant light.
     scene : path, dict or mi.Scene, optional
@@ -60,7 +63,8 @@ def compare(
     spp : int
         Samples per pixel of the reference image.
     reference : 'modelled' or 'full'
-        Truth as modelled (other materials replaced by their diffuse albedo, emitters that are not asked for dark) or as written.
+        Truth as modelled (other materials replaced by their diffuse albedo, emitters that are not
+        asked for dark) or as written.
     seed : int
     progress : callable(stage, done, total)
     nearest : int
@@ -71,10 +75,11 @@ def compare(
     Returns
     -------
     dict
-        points{count, relative_rmse, bias, reference_noise, …}, image{relative_rmse, bias, psnr, flip,
-        reference_noise, …}, seconds{relight, reference}, and what was compared. Of an asset of distant light, with local lights, also
-        local_light_error{relative_rmse, bias, points}: that of their irradiance alone. Of one of local lights also
-        components{direct, indirect} with errors as those of the points.
+        points{count, relative_rmse, bias, reference_noise, …}, image{relative_rmse, bias, psnr,
+        flip, reference_noise, …}, seconds{relight, reference}, and what was compared. Of an asset
+        of distant light, with local lights, also local_light_error{relative_rmse, bias, points}:
+        that of their irradiance alone. Of one of local lights also components{direct, indirect}
+        with errors as those of the points.
 
     Warns
     -----
@@ -84,16 +89,24 @@ def compare(
     if reference not in REFERENCES:
         raise SettingsError(f"reference '{reference}' is not known: use {' or '.join(REFERENCES)}")
     if spp < 2:
-        raise SettingsError(f"spp {spp} is too low: the reference's noise is told from two halves, so at least 2")
+        raise SettingsError(
+            f"spp {spp} is too low: the reference's noise is told from two halves, so at least 2"
+        )
     folder = _made_folder(folder)
     opened = open_scene_of(asset, scene)
     if isinstance(asset, MeshlessAsset):
         if rotate is not None or nearest != 1:
-            raise SettingsError("rotate and nearest are for distant light, and this asset is one of local lights (points='samples')")
+            raise SettingsError(
+                "rotate and nearest are for distant light, and this asset is one of local lights"
+                " (points='samples')"
+            )
         case = _under_local_lights(asset, opened, light, reference, direct, seed)
     else:
         if direct != "points":
-            raise SettingsError(f"direct '{direct}' is for an asset of local lights (points='samples'), and this is one of distant light")
+            raise SettingsError(
+                f"direct '{direct}' is for an asset of local lights (points='samples'), and this is"
+                " one of distant light"
+            )
         case = _under_distant_light(asset, opened, light, rotate, reference, nearest, seed)
     seconds = {}
 
@@ -108,11 +121,15 @@ def compare(
     bounces = asset.reference_bounces
     points = asset.points.at(chosen)
     truth_direct = ground_truth.point_irradiance(case.truth, points, POINT_SAMPLES, seed)
-    truth_indirect = ground_truth.indirect_irradiance(case.truth, points, POINT_PATHS, bounces, seed)
+    truth_indirect = ground_truth.indirect_irradiance(
+        case.truth, points, POINT_PATHS, bounces, seed
+    )
 
     progress("reference image", 2, 3)
     with resized(pick_sensor(case.truth, sensor), size) as camera:
-        expected = ground_truth.image(case.truth, camera, spp, seed, ground_truth.path_depth(bounces))
+        expected = ground_truth.image(
+            case.truth, camera, spp, seed, ground_truth.path_depth(bounces)
+        )
         seconds["reference"] = time.perf_counter() - started
         result = case.image(camera, irradiance)
         covered = coverage(case.truth, camera, IMAGE_SAMPLES, seed) > 1 - 1e-4
@@ -126,7 +143,9 @@ def compare(
         "bounces": asset.report["bounces"],
         "reference_bounces": "any number" if bounces is None else bounces,
         **case.told(chosen, truth_direct, truth_indirect),
-        "points": {"count": len(chosen)} | _errors(irradiance[chosen], truth_direct + truth_indirect),
+        "points": (
+            {"count": len(chosen)} | _errors(irradiance[chosen], truth_direct + truth_indirect)
+        ),
         "image": _image_errors(result, expected, covered),
         "seconds": {name: round(value, 4) for name, value in seconds.items()},
     }
@@ -164,18 +183,26 @@ def _under_distant_light(asset, opened, light, rotate, reference, nearest, seed)
             "coefficients": len(asset.basis),
             "directions": len(asset.directions),
             # What the reference has more:
-            "bounce_energy_left": asset.report.get("bounce_energy_left", 0.0) if any_number else 0.0,
+            "bounce_energy_left": (
+                asset.report.get("bounce_energy_left", 0.0) if any_number else 0.0
+            ),
             "indirect_noise": asset.report.get("indirect_noise", 0.0),
             "captured_variance": asset.report["captured_variance"],
         }
         if chosen_light.point_lights:
-            report["local_light_error"] = measure_error(asset, chosen_light.point_lights, nearest, opened, seed)
+            report["local_light_error"] = measure_error(
+                asset, chosen_light.point_lights, nearest, opened, seed
+            )
         return report
 
     return _Case(
         truth,
-        lambda: asset.irradiance_from(*asset.project_light(chosen_light), chosen_light.point_lights, nearest),
-        lambda camera, irradiance: render_image(asset, truth, camera, IMAGE_SAMPLES, seed, irradiance),
+        lambda: asset.irradiance_from(
+            *asset.project_light(chosen_light), chosen_light.point_lights, nearest
+        ),
+        lambda camera, irradiance: render_image(
+            asset, truth, camera, IMAGE_SAMPLES, seed, irradiance
+        ),
         told,
     )
 
@@ -183,7 +210,9 @@ def _under_distant_light(asset, opened, light, rotate, reference, nearest, seed)
 def _under_local_lights(asset, opened, light, reference, direct, seed):
     shown, keep_local, chosen_light = chosen_local_light(opened, light)
     as_written = opened.mi_scene if keep_local else opened.unlit()
-    truth = lit_scene(opened.modelled(keep_local) if reference == "modelled" else as_written, shown, keep_local)
+    truth = lit_scene(
+        opened.modelled(keep_local) if reference == "modelled" else as_written, shown, keep_local
+    )
 
     def told(chosen, truth_direct, truth_indirect):
         components = {"direct": truth_direct, "indirect": truth_indirect}
@@ -193,7 +222,8 @@ def _under_local_lights(asset, opened, light, reference, direct, seed):
             "transfer_coefficients": asset.settings["transfer_coefficients"],
             "misclassified_visibility": asset.report["misclassified_visibility"],
             "components": {
-                name: _errors(asset.irradiance(chosen_light, name)[chosen], expected) for name, expected in components.items()
+                name: _errors(asset.irradiance(chosen_light, name)[chosen], expected)
+                for name, expected in components.items()
             },
         }
 
@@ -201,7 +231,9 @@ def _under_local_lights(asset, opened, light, reference, direct, seed):
         if direct == "points":
             return render_image(asset, truth, camera, IMAGE_SAMPLES, seed, irradiance)
         indirect = asset.irradiance(chosen_light, "indirect")
-        return render_image(asset, truth, camera, IMAGE_SAMPLES, seed, indirect, emission_of(chosen_light))
+        return render_image(
+            asset, truth, camera, IMAGE_SAMPLES, seed, indirect, emission_of(chosen_light)
+        )
 
     return _Case(truth, lambda: asset.irradiance(chosen_light), image, told)
 
@@ -213,7 +245,9 @@ def _made_folder(folder):
         (folder / ".writable").touch()
         (folder / ".writable").unlink()
     except OSError as error:
-        raise SettingsError(f"output folder '{folder}' cannot be written: {error.strerror}") from None
+        raise SettingsError(
+            f"output folder '{folder}' cannot be written: {error.strerror}"
+        ) from None
     return folder
 
 

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..lighting.scene_light import point_emitter
-from ..system.runtime import mitsuba
 from ..scene.scene import scale_of
+from ..system.runtime import mitsuba
 
 LANES = 1 << 21
 RIM_INSET = 2e-5  # share of the scene's scale by which points on the rim of a surface are moved in
@@ -27,7 +27,9 @@ class Reference:
 
     def __add__(self, other):
         """The sum of two independent estimates."""
-        return Reference(self.mean + other.mean, np.hypot(self.standard_error, other.standard_error))
+        return Reference(
+            self.mean + other.mean, np.hypot(self.standard_error, other.standard_error)
+        )
 
     @property
     def noise(self):
@@ -37,10 +39,11 @@ class Reference:
 
 
 def point_irradiance(mi_scene, points, spp, seed=0):
-    """Irradiance at points by Mitsuba's emitter sampling: no lattice, no basis, none of this program's rays.
+    """Irradiance at points by Mitsuba's emitter sampling: no lattice, no basis, none of this
+    program's rays.
 
-    Samples are stratified along the number that picks the emitter, so that each gets its share of them. A few local and
-    directional lights then have next to no noise.
+    Samples are stratified along the number that picks the emitter, so that each gets its share of
+    them. A few local and directional lights then have next to no noise.
 
     Parameters
     ----------
@@ -66,34 +69,48 @@ def point_irradiance(mi_scene, points, spp, seed=0):
         sample, weight = mi_scene.sample_emitter_direction(si, place, True)
         value = _received(si, sample, weight)
         sums = [dr.block_sum(channel, spp) for channel in value]
-        # The squared difference of samples of neighbouring strata is, in the mean, no less than the sum of their variances.
+        # The squared difference of samples of neighbouring strata is, in the mean, no less than the
+        # sum of their variances.
         pairs = dr.arange(mi.UInt32, dr.width(number) // 2) * 2
-        differences = [dr.gather(mi.Float, x, pairs) - dr.gather(mi.Float, x, pairs + 1) for x in value]
+        differences = [
+            dr.gather(mi.Float, x, pairs) - dr.gather(mi.Float, x, pairs + 1) for x in value
+        ]
         squares = [dr.block_sum(x * x, spp // 2) for x in differences]
         dr.eval(sums, squares)
         means[block] = np.stack([np.array(x, dtype=np.float64) for x in sums], axis=-1) / spp
-        errors[block] = np.sqrt(np.stack([np.array(x, dtype=np.float64) for x in squares], axis=-1)) / spp
+        errors[block] = (
+            np.sqrt(np.stack([np.array(x, dtype=np.float64) for x in squares], axis=-1)) / spp
+        )
     return Reference(means, errors)
 
 
 def compared_points(asset, most, seed=0):
-    """Indices of the points, at most so many, at which an asset is compared with the truth; buried ones, which nothing shows, are not."""
+    """Indices of the points, at most so many, at which an asset is compared with the truth; buried
+    ones, which nothing shows, are not.
+    """
     shown = np.flatnonzero(~asset.buried | asset.buried.all())
     return np.sort(np.random.default_rng(seed).permutation(shown)[:most])
 
 
 def irradiance(mi_scene, points, spp, paths, bounces=None, seed=0):
-    """Irradiance at points, direct and after reflections; see `point_irradiance` and `indirect_irradiance`."""
-    return point_irradiance(mi_scene, points, spp, seed) + indirect_irradiance(mi_scene, points, paths, bounces, seed)
+    """Irradiance at points, direct and after reflections; see `point_irradiance` and
+    `indirect_irradiance`.
+    """
+    return point_irradiance(mi_scene, points, spp, seed) + indirect_irradiance(
+        mi_scene, points, paths, bounces, seed
+    )
 
 
 def path_depth(bounces):
-    """Mitsuba's `max_depth` for images of light after so many reflections on its way to what is seen; None is any number."""
+    """Mitsuba's `max_depth` for images of light after so many reflections on its way to what is
+    seen; None is any number.
+    """
     return -1 if bounces is None else bounces + 2
 
 
 def indirect_irradiance(mi_scene, points, spp, bounces=None, seed=0):
-    """Irradiance at points after one reflection and more, by Mitsuba's path tracer along cosine-distributed rays.
+    """Irradiance at points after one reflection and more, by Mitsuba's path tracer along
+    cosine-distributed rays.
 
     Parameters
     ----------
@@ -125,19 +142,24 @@ def indirect_irradiance(mi_scene, points, spp, bounces=None, seed=0):
         ray = mi.RayDifferential3f(si.spawn_ray(direction))
         seen = mi_scene.ray_intersect(ray)
         radiance = integrator.sample(mi_scene, sampler, ray, active=seen.is_valid())[0]
-        # Light of what is seen is direct. Mitsuba's `hide_emitters` would also leave out the shapes that emit.
+        # Light of what is seen is direct. Mitsuba's `hide_emitters` would also leave out the shapes
+        # that emit.
         value = (mi.Color3f(radiance) - seen.emitter(mi_scene).eval(seen, seen.is_valid())) * dr.pi
         sums = [dr.block_sum(channel, spp) for channel in value]
         squares = [dr.block_sum(channel * channel, spp) for channel in value]
         dr.eval(sums, squares)
-        mean, square = (np.stack([np.array(x, dtype=np.float64) for x in y], axis=-1) / spp for y in (sums, squares))
+        mean, square = (
+            np.stack([np.array(x, dtype=np.float64) for x in y], axis=-1) / spp
+            for y in (sums, squares)
+        )
         means[block] = mean
         errors[block] = np.sqrt(np.maximum(square - mean**2, 0) / (spp - 1))
     return Reference(means, errors)
 
 
 def local_irradiance(mi_scene, points, lights):
-    """Irradiance at points under local lights by Mitsuba's emitters and shadow rays, one light at a time: without noise.
+    """Irradiance at points under local lights by Mitsuba's emitters and shadow rays, one light at a
+    time: without noise.
 
     Parameters
     ----------
@@ -164,7 +186,9 @@ def local_irradiance(mi_scene, points, lights):
 
 
 def _samples(mi_scene, points, spp, seed):
-    """Blocks of samples: the slice of points, a sampler, Mitsuba's interactions, `spp` for each point, and the number of each there."""
+    """Blocks of samples: the slice of points, a sampler, Mitsuba's interactions, `spp` for each
+    point, and the number of each there.
+    """
     import drjit as dr
 
     mi = mitsuba()
@@ -185,7 +209,8 @@ def _interactions(mi_scene, points):
     import drjit as dr
 
     mi = mitsuba()
-    # A rim may lie on another surface, where Mitsuba's own offset along the normal would leave rays on either side of it.
+    # A rim may lie on another surface, where Mitsuba's own offset along the normal would leave rays
+    # on either side of it.
     positions = points.positions + np.float32(RIM_INSET * scale_of(mi_scene)) * points.insets
     positions, normals = mi.Float(positions.ravel()), mi.Float(points.normals.ravel())
     geometric = mi.Float(points.geometric_normals.ravel())
@@ -201,7 +226,9 @@ def _interactions(mi_scene, points):
 
 
 def _received(si, sample, weight):
-    """Irradiance of a sample of an emitter; none from a light in the point itself, which has no direction."""
+    """Irradiance of a sample of an emitter; none from a light in the point itself, which has no
+    direction.
+    """
     import drjit as dr
 
     value = mitsuba().Color3f(weight) * dr.maximum(dr.dot(si.sh_frame.n, sample.d), 0)
@@ -230,7 +257,9 @@ def image(mi_scene, sensor, spp, seed=0, max_depth=2):
     integrator = mi.load_dict({"type": "path", "max_depth": max_depth})
     half = max(1, (spp + 1) // 2)
     first, second = (
-        np.array(mi.render(mi_scene, sensor=sensor, integrator=integrator, spp=half, seed=s))[..., :3]
+        np.array(mi.render(mi_scene, sensor=sensor, integrator=integrator, spp=half, seed=s))[
+            ..., :3
+        ]
         for s in (2 * seed, 2 * seed + 1)
     )
     return Reference((first + second) / 2, np.abs(first - second) / 2)

@@ -5,7 +5,9 @@ import numpy as np
 
 def relative_rmse(result, reference):
     """‖result − reference‖ / ‖reference‖ over all entries; 0 where both are zero."""
-    return _ratio(np.linalg.norm(np.subtract(result, reference, dtype=np.float64)), np.linalg.norm(reference))
+    return _ratio(
+        np.linalg.norm(np.subtract(result, reference, dtype=np.float64)), np.linalg.norm(reference)
+    )
 
 
 def relative_bias(result, reference):
@@ -21,7 +23,9 @@ def _ratio(error, size):
 
 
 def psnr(result, reference, mask=None):
-    """Peak signal-to-noise ratio in dB of two displayed images (values 0…1) over the pixels of `mask`."""
+    """Peak signal-to-noise ratio in dB of two displayed images (values 0…1) over the pixels of
+    `mask`.
+    """
     difference = np.subtract(result, reference, dtype=np.float64)
     squares = difference**2 if mask is None else difference[mask] ** 2
     mean = squares.mean() if squares.size else 0.0

@@ -6,17 +6,19 @@ from pathlib import Path
 
 import numpy as np
 
-from ..render.display import LUMINANCE, display
 from ..output.export import write_displayed, write_image
+from ..render.display import LUMINANCE, display
 from . import metrics
 
 _PAGE = """<!doctype html>
 <html lang="en"><meta charset="utf-8"><title>mi_prt comparison</title>
 <style>
-body {{ font: 16px/1.5 system-ui, sans-serif; max-width: 72rem; margin: 2rem auto; padding: 0 1rem; color: #222 }}
+body {{ font: 16px/1.5 system-ui, sans-serif; max-width: 72rem; margin: 2rem auto }}
+body {{ padding: 0 1rem; color: #222 }}
 main {{ display: grid; grid-template-columns: 1fr 1fr; gap: 1rem }} figure {{ margin: 0 }}
 img {{ max-width: 100%; image-rendering: auto }}
-table {{ border-collapse: collapse; margin: 1rem 0 }} td, th {{ padding: .2rem 1rem .2rem 0; text-align: right }}
+table {{ border-collapse: collapse; margin: 1rem 0 }}
+td, th {{ padding: .2rem 1rem .2rem 0; text-align: right }}
 th:first-child, td:first-child {{ text-align: left }} tr {{ border-bottom: 1px solid #ddd }}
 </style>
 <h1>{title}</h1>
@@ -24,13 +26,17 @@ th:first-child, td:first-child {{ text-align: left }} tr {{ border-bottom: 1px s
 <main>
 <figure><img src="result.png" alt=""><figcaption>mi_prt</figcaption></figure>
 <figure><img src="reference.png" alt=""><figcaption>Mitsuba, {reference}</figcaption></figure>
-<figure><img src="error.png" alt=""><figcaption>Signed luminance error: blue darker, red brighter, full colour at
+<figure><img src="error.png" alt=""><figcaption>Signed luminance error:
+blue darker, red brighter, full colour at
 &plusmn;{error_range:.0%} of the mean</figcaption></figure>
-<figure><img src="flip.png" alt=""><figcaption>FLIP: dark is equal to the eye, bright is different</figcaption></figure>
+<figure><img src="flip.png" alt=""><figcaption>FLIP: dark is equal to the eye,
+bright is different</figcaption></figure>
 </main>
-<table><tr><th></th><th>relative RMSE</th><th>beyond noise</th><th>bias</th><th>reference noise</th><th>PSNR</th><th>FLIP</th></tr>
+<table><tr><th></th><th>relative RMSE</th><th>beyond noise</th><th>bias</th>
+<th>reference noise</th><th>PSNR</th><th>FLIP</th></tr>
 <tr><td>{count:,} points, irradiance</td>{points}<td></td><td></td></tr>
-{components}<tr><td>image, radiance where geometry covers the pixel</td>{image}<td>{psnr:.1f} dB</td><td>{flip:.4f}</td></tr></table>
+{components}<tr><td>image, radiance where geometry covers the pixel</td>{image}
+<td>{psnr:.1f} dB</td><td>{flip:.4f}</td></tr></table>
 <h2>What makes the error</h2>
 <ul>{causes}</ul>
 </html>
@@ -58,15 +64,24 @@ def write_report(folder, report, result, reference, covered):
     flip_map = _coloured(metrics.flip(shown, truth)[1], "magma")
     write_image(folder / "result.exr", result)
     write_image(folder / "reference.exr", reference)
-    for name, picture in (("result", shown), ("reference", truth), ("error", error), ("flip", flip_map)):
+    for name, picture in (
+        ("result", shown),
+        ("reference", truth),
+        ("error", error),
+        ("flip", flip_map),
+    ):
         write_displayed(folder / f"{name}.png", picture)
     write_displayed(folder / "side_by_side.png", np.concatenate([shown, truth, error], axis=1))
-    (folder / "report.json").write_text(json.dumps(finite(report), indent=2, allow_nan=False) + "\n")
+    (folder / "report.json").write_text(
+        json.dumps(finite(report), indent=2, allow_nan=False) + "\n"
+    )
     (folder / "index.html").write_text(_page(report))
 
 
 def finite(value):
-    """Plain data with null for numbers that JSON cannot hold (the PSNR of equal images is infinite)."""
+    """Plain data with null for numbers that JSON cannot hold (the PSNR of equal images is
+    infinite).
+    """
     if isinstance(value, dict):
         return {key: finite(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
@@ -96,15 +111,16 @@ def _page(report):
     return _PAGE.format(
         title=html.escape(Path(report["scene"] or "scene in memory").name),
         summary=html.escape(
-            f"{_held(report)} Relit in {1e3 * report['seconds']['relight']:.0f} ms; the reference took "
-            f"{report['seconds']['reference']:.1f} s."
+            f"{_held(report)} Relit in {1e3 * report['seconds']['relight']:.0f} ms; the reference"
+            f" took {report['seconds']['reference']:.1f} s."
         ),
         reference=report["reference"],
         error_range=ERROR_RANGE,
         count=points["count"],
         points=cells(points),
         components="".join(
-            f"<tr><td>{name} light of it</td>{cells(errors)}<td></td><td></td></tr>\n" for name, errors in report.get("components", {}).items()
+            f"<tr><td>{name} light of it</td>{cells(errors)}<td></td><td></td></tr>\n"
+            for name, errors in report.get("components", {}).items()
         ),
         image=cells(picture),
         psnr=picture["psnr"],
@@ -117,58 +133,88 @@ def _held(report):
     """What the asset holds, in words."""
     if "transfer_coefficients" in report:
         return (
-            f"{report['coefficients']} coefficients of depth in {report['directions']:,} directions at each sample, "
-            f"{report['transfer_coefficients']} of direct light on each cluster."
+            f"{report['coefficients']} coefficients of depth in {report['directions']:,} directions"
+            f" at each sample, {report['transfer_coefficients']} of direct light on each cluster."
         )
     return (
-        f"{report['coefficients']} coefficients over {report['directions']:,} directions hold {report['captured_variance']:.2%} of the "
-        "transport's variance (relighting includes averaging light over the lattice)."
+        f"{report['coefficients']} coefficients over {report['directions']:,} directions hold"
+        f" {report['captured_variance']:.2%} of the transport's variance (relighting includes"
+        " averaging light over the lattice)."
     )
 
 
 def _causes(report):
     """The sources of error that this comparison can hold, in words."""
     yield (
-        f"Reference noise: {report['points']['reference_noise']:.2%} at the points and "
-        f"{report['image']['reference_noise']:.2%} in the image are Mitsuba's own; more spp lower them."
+        f"Reference noise: {report['points']['reference_noise']:.2%} at the points and"
+        f" {report['image']['reference_noise']:.2%} in the image are Mitsuba's own; more spp lower"
+        " them."
     )
-    yield from _local_causes(report) if "transfer_coefficients" in report else _distant_causes(report)
-    yield "Points: irradiance is interpolated between points; shadows narrower than their distance are lost."
+    yield from (
+        _local_causes(report) if "transfer_coefficients" in report else _distant_causes(report)
+    )
+    yield (
+        "Points: irradiance is interpolated between points; shadows narrower than their distance"
+        " are lost."
+    )
     for entry in report["left_out"]:
-        share = f" ({entry['share']:.0%} of the light those shapes scatter)" if entry["share"] is not None else ""
-        seen = "in the reference, not in the result" if report["reference"] == "full" else "in neither image"
+        share = (
+            f" ({entry['share']:.0%} of the light those shapes scatter)"
+            if entry["share"] is not None
+            else ""
+        )
+        seen = (
+            "in the reference, not in the result"
+            if report["reference"] == "full"
+            else "in neither image"
+        )
         yield f"Not modelled: {entry['what']}{share}, {seen}."
 
 
 def _distant_causes(report):
     if report["basis"] != "none":
         yield (
-            f"Compression: {1 - report['captured_variance']:.2%} of the transport's variance is not in the basis ({report['basis']}); "
-            "more coefficients lower it."
+            f"Compression: {1 - report['captured_variance']:.2%} of the transport's variance is not"
+            f" in the basis ({report['basis']}); more coefficients lower it."
         )
     if "local_light_error" in report:
         local = report["local_light_error"]
         yield (
-            f"Local lights: {local['relative_rmse']:.1%} relative RMSE and {local['bias']:+.1%} bias by themselves. They are seen through "
-            "the nearest directions of the lattice, and where they stand inside the scene's convex hull, with visibility to infinity."
+            f"Local lights: {local['relative_rmse']:.1%} relative RMSE and {local['bias']:+.1%}"
+            " bias by themselves. They are seen through the nearest directions of the lattice, and"
+            " where they stand inside the scene's convex hull, with visibility to infinity."
         )
     if report["bounces"] != 0:
-        noise = f"noise {report['indirect_noise']:.2%} of the transport" if report["indirect_noise"] else "without noise"
+        noise = (
+            f"noise {report['indirect_noise']:.2%} of the transport"
+            if report["indirect_noise"]
+            else "without noise"
+        )
         left = report["bounce_energy_left"]
-        left = "has no known bound" if left is None else f"is at most {left:.2%} of the direct light of an open sky"
-        yield f"Reflections: {noise} (more --paths-per-point lower it); light of the last ones left out {left}."
+        left = (
+            "has no known bound"
+            if left is None
+            else f"is at most {left:.2%} of the direct light of an open sky"
+        )
+        yield (
+            f"Reflections: {noise} (more --paths-per-point lower it); light of the last ones left"
+            f" out {left}."
+        )
     yield (
-        f"Directions: light and shadows are averaged over cells of "
-        f"{np.degrees(np.sqrt(4 * np.pi / report['directions'])):.1f}°, which blurs the shadow of a small sun."
+        "Directions: light and shadows are averaged over cells of"
+        f" {np.degrees(np.sqrt(4 * np.pi / report['directions'])):.1f}°, which blurs the shadow of"
+        " a small sun."
     )
 
 
 def _local_causes(report):
     yield (
-        f"Visibility: depth buffers of {report['directions']:,} directions err about {report['misclassified_visibility']:.1%} of the pairs of "
-        "a sample and a light, at the edges of shadows; more --depth-directions and --depth-coefficients lower it."
+        f"Visibility: depth buffers of {report['directions']:,} directions err about"
+        f" {report['misclassified_visibility']:.1%} of the pairs of a sample and a light, at the"
+        " edges of shadows; more --depth-directions and --depth-coefficients lower it."
     )
     yield (
-        f"Reflections: {report['transfer_coefficients']} patterns on each cluster stand for direct light; more --transfer-coefficients, "
-        "smaller clusters and a smaller --transfer-error lower what they lose."
+        f"Reflections: {report['transfer_coefficients']} patterns on each cluster stand for direct"
+        " light; more --transfer-coefficients, smaller clusters and a smaller --transfer-error"
+        " lower what they lose."
     )

@@ -1,7 +1,8 @@
 """Distant light averaged over the cells of a direction lattice.
 
-A cell's radiance is the mean over its solid angle, so that no source is missed, however small, and none is
-counted at its peak. Energy is exact, and a constant map gives the same constant in every cell.
+A cell's radiance is the mean over its solid angle, so that no source is missed, however small, and
+none is counted at its peak. Energy is exact, and a constant map gives the same constant in every
+cell.
 """
 
 import numpy as np
@@ -35,7 +36,10 @@ def cell_radiance(light, directions, samples_per_side=SAMPLES_PER_CELL_SIDE):
     """
     light = as_light(light)
     if not light.local.is_empty:
-        raise LightError("a local light shines from another direction at each point: pass it to Asset.irradiance or relight")
+        raise LightError(
+            "a local light shines from another direction at each point: pass it to Asset.irradiance"
+            " or relight"
+        )
     radiance = np.zeros((len(directions), 3))
     spacing = np.sqrt(4 * np.pi / len(directions)) / samples_per_side
     for environment in light.maps:
@@ -49,11 +53,11 @@ def cell_radiance(light, directions, samples_per_side=SAMPLES_PER_CELL_SIDE):
 def average(environment, spacing, directions):
     """Mean radiance of each cell from samples that cover the sphere.
 
-    Samples are given whole to the cell that holds their direction. The solid angle a cell receives then differs
-    a little from its own; the difference is traded with its neighbours at the radiance of the cell's dimmest
-    sample, which keeps a sun whole and a constant constant, and what imbalance that leaves (of the order of
-    1e-4) is scaled away. A cell so thin that no sample falls into it (at the pole of a long latitude-longitude lattice) has
-    the radiance at its direction.
+    Samples are given whole to the cell that holds their direction. The solid angle a cell receives
+    then differs a little from its own; the difference is traded with its neighbours at the radiance
+    of the cell's dimmest sample, which keeps a sun whole and a constant constant, and what
+    imbalance that leaves (of the order of 1e-4) is scaled away. A cell so thin that no sample falls
+    into it (at the pole of a long latitude-longitude lattice) has the radiance at its direction.
 
     Parameters
     ----------

@@ -1,4 +1,6 @@
-"""Local lights of every kind as one: places that emit, each with an intensity, an axis and a shape of emission."""
+"""Local lights of every kind as one: places that emit, each with an intensity, an axis and a shape
+of emission.
+"""
 
 from dataclasses import dataclass, fields
 
@@ -7,7 +9,14 @@ import numpy as np
 from ..errors import LightError
 from .values import is_finite, numbers
 
-_SHAPES = {"positions": (3,), "axes": (3,), "intensity": (3,), "cosine": (), "cutoff": (), "beam": ()}
+_SHAPES = {
+    "positions": (3,),
+    "axes": (3,),
+    "intensity": (3,),
+    "cosine": (),
+    "cutoff": (),
+    "beam": (),
+}
 BLOCK = 1 << 20  # pairs of surface points and emitting places computed at a time
 
 
@@ -15,8 +24,9 @@ BLOCK = 1 << 20  # pairs of surface points and emitting places computed at a tim
 class Emission:
     """k places that emit light.
 
-    A place with the intensity I sends the irradiance E = I · f(ω) · V · max(0, −ω·n)/r² to a surface with the normal n that it
-    sees (V = 1, else 0) at the distance r in the direction ω; f is `shape`.
+    A place with the intensity I sends the irradiance E = I · f(ω) · V · max(0, −ω·n)/r² to a
+    surface with the normal n that it sees (V = 1, else 0) at the distance r in the direction ω; f
+    is `shape`.
 
     Parameters
     ----------
@@ -27,11 +37,13 @@ class Emission:
     intensity : (k, 3) float32
         RGB in W/sr along the axis.
     cosine : (k,) float32
-        1 where intensity falls with the cosine of the angle to the axis, as that of a small flat area, and is zero behind; else 0.
+        1 where intensity falls with the cosine of the angle to the axis, as that of a small flat
+        area, and is zero behind; else 0.
     cutoff : (k,) float32
         Angle to the axis, in radians, beyond which it is dark; π if there is no such.
     beam : (k,) float32
-        Angle to the axis from which on intensity falls linearly to zero at the cutoff; π if there is no such.
+        Angle to the axis from which on intensity falls linearly to zero at the cutoff; π if there
+        is no such.
 
     Raises
     ------
@@ -52,11 +64,14 @@ class Emission:
             values = numbers(getattr(self, name))
             if values.shape != (count, *shape) or not is_finite(values):
                 raise LightError(
-                    f"an emission's {name} must be {(count, *shape)} finite float32 numbers, got shape {values.shape}"
+                    f"an emission's {name} must be {(count, *shape)} finite float32 numbers, got"
+                    f" shape {values.shape}"
                 )
             object.__setattr__(self, name, values.astype(np.float32))
         if (self.intensity < 0).any():
-            raise LightError(f"an emission's intensity must not be negative, got {self.intensity.min():g}")
+            raise LightError(
+                f"an emission's intensity must not be negative, got {self.intensity.min():g}"
+            )
 
     def __len__(self):
         return len(self.positions)
@@ -76,7 +91,9 @@ class Emission:
         """
         cosine = np.clip((directions * self.axes.astype(np.float64)).sum(axis=-1), -1, 1)
         angle = np.arccos(cosine)
-        transition = np.maximum(self.cutoff - self.beam, np.finfo(np.float32).tiny).astype(np.float64)
+        transition = np.maximum(self.cutoff - self.beam, np.finfo(np.float32).tiny).astype(
+            np.float64
+        )
         cone = np.where(angle <= self.beam, 1, np.clip((self.cutoff - angle) / transition, 0, 1))
         return np.where(self.cosine > 0, np.maximum(cosine, 0), 1) * cone
 
@@ -102,8 +119,12 @@ class Emission:
             distance = np.linalg.norm(travel, axis=-1, keepdims=True)
             here = distance == 0
             travel /= np.where(here, 1, distance)
-            received = np.maximum(-(travel * normals[block, None]).sum(axis=-1), 0) * self.shape(travel)
-            total[block] = (received / np.where(here, np.inf, distance)[..., 0] ** 2) @ self.intensity.astype(np.float64)
+            received = np.maximum(-(travel * normals[block, None]).sum(axis=-1), 0) * self.shape(
+                travel
+            )
+            total[block] = (
+                received / np.where(here, np.inf, distance)[..., 0] ** 2
+            ) @ self.intensity.astype(np.float64)
         return total
 
 
@@ -117,16 +138,25 @@ def emission_of(light):
     Returns
     -------
     Emission
-        Of point lights, spot lights, area lights and emissions, in this order; of no places where there are none.
+        Of point lights, spot lights, area lights and emissions, in this order; of no places where
+        there are none.
     """
-    parts = [*map(_point, light.point_lights), *map(_spot, light.spot_lights), *map(_area, light.area_lights), *light.emissions]
+    parts = [
+        *map(_point, light.point_lights),
+        *map(_spot, light.spot_lights),
+        *map(_area, light.area_lights),
+        *light.emissions,
+    ]
     names = [field.name for field in fields(Emission)]
     empty = {name: np.empty((0, *shape)) for name, shape in _SHAPES.items()}
-    return Emission(*(np.concatenate([empty[name], *(getattr(part, name) for part in parts)]) for name in names))
+    return Emission(
+        *(np.concatenate([empty[name], *(getattr(part, name) for part in parts)]) for name in names)
+    )
 
 
 def flat_emission(positions, normals, intensity):
-    """Emission of small flat areas: that of a Lambertian surface, which falls with the cosine to its normal.
+    """Emission of small flat areas: that of a Lambertian surface, which falls with the cosine to
+    its normal.
 
     Parameters
     ----------
@@ -135,7 +165,9 @@ def flat_emission(positions, normals, intensity):
         Radiance times area, in W/sr.
     """
     count = len(positions)
-    return Emission(positions, normals, intensity, np.ones(count), np.full(count, np.pi), np.full(count, np.pi))
+    return Emission(
+        positions, normals, intensity, np.ones(count), np.full(count, np.pi), np.full(count, np.pi)
+    )
 
 
 def _point(light):
@@ -144,12 +176,17 @@ def _point(light):
 
 def _spot(light):
     cutoff, beam = np.radians([[light.cutoff_degrees], [light.beam_degrees]])
-    return Emission(light.position[None], light.direction[None], light.intensity[None], [0], cutoff, beam)
+    return Emission(
+        light.position[None], light.direction[None], light.intensity[None], [0], cutoff, beam
+    )
 
 
 def _area(light):
     side = round(light.samples**0.5)
     u, v = (np.indices((side, side)).reshape(2, -1, 1) + 0.5) / side - 0.5
     positions = light.centre + u * light.edge_u + v * light.edge_v
-    normals, intensity = (np.tile(x, (light.samples, 1)) for x in (light.normal, light.radiance * light.area / light.samples))
+    normals, intensity = (
+        np.tile(x, (light.samples, 1))
+        for x in (light.normal, light.radiance * light.area / light.samples)
+    )
     return flat_emission(positions, normals, intensity)

@@ -9,7 +9,8 @@ import numpy as np
 
 from ..errors import LightError
 
-NEGATIVE_ENERGY_LIMIT = 1e-3  # share of a map's energy beyond which negative pixels are damage, not compression noise
+# share of a map's energy beyond which negative pixels are damage, not compression noise
+NEGATIVE_ENERGY_LIMIT = 1e-3
 
 
 class LightWarning(UserWarning):
@@ -20,9 +21,10 @@ class LightWarning(UserWarning):
 class EnvironmentMap:
     """Distant light from an equirectangular map of radiance.
 
-    The convention is that of Mitsuba's `envmap`: +y is up, and the point (u, v) of the image looks along
-    (sin 2πu · sin πv, cos πv, −cos 2πu · sin πv) in the map's frame. Radiance is interpolated bilinearly between
-    pixels at u = (column + ½)/w and v = row/(h − 1): the first and last rows lie on the poles.
+    The convention is that of Mitsuba's `envmap`: +y is up, and the point (u, v) of the image looks
+    along (sin 2πu · sin πv, cos πv, −cos 2πu · sin πv) in the map's frame. Radiance is interpolated
+    bilinearly between pixels at u = (column + ½)/w and v = row/(h − 1): the first and last rows lie
+    on the poles.
 
     Parameters
     ----------
@@ -42,8 +44,8 @@ class EnvironmentMap:
     Raises
     ------
     LightError
-        If the file cannot be read or lacks a channel, the array is not of shape (h, w, 3), pixels are NaN or
-        infinite, or negative pixels carry more than 1e-3 of the energy.
+        If the file cannot be read or lacks a channel, the array is not of shape (h, w, 3), pixels
+        are NaN or infinite, or negative pixels carry more than 1e-3 of the energy.
     """
 
     source: object = field(repr=False)
@@ -56,12 +58,16 @@ class EnvironmentMap:
         pixels, negative = _validated(_read(self.source), self.scale)
         object.__setattr__(self, "pixels", pixels)
         object.__setattr__(self, "negative_pixels", negative)
-        object.__setattr__(self, "source", str(self.source) if isinstance(self.source, str | Path) else pixels)
+        object.__setattr__(
+            self, "source", str(self.source) if isinstance(self.source, str | Path) else pixels
+        )
         object.__setattr__(self, "rotation", orthonormal(self.rotation))
         object.__setattr__(self, "scale", 1.0)
 
     def rotated(self, axis, degrees):
-        """The same light turned about `axis` (x, y, z or a vector of 3) by `degrees`, right-handed, in world space."""
+        """The same light turned about `axis` (x, y, z or a vector of 3) by `degrees`, right-handed,
+        in world space.
+        """
         turned = copy(self)  # the pixels are checked already
         object.__setattr__(turned, "rotation", rotation_matrix(axis, degrees) @ self.rotation)
         return turned
@@ -72,7 +78,9 @@ class EnvironmentMap:
         return self.pixels.shape[:2]
 
     def at(self, vectors):
-        """Radiance (k, 3) that arrives from unit directions (k, 3) in world space, bilinear as in Mitsuba."""
+        """Radiance (k, 3) that arrives from unit directions (k, 3) in world space, bilinear as in
+        Mitsuba.
+        """
         height, width = self.size
         x, y, z = (vectors @ self.rotation).T
         column = np.arctan2(x, -z) * (width / (2 * np.pi)) - 0.5
@@ -87,10 +95,11 @@ class EnvironmentMap:
         return upper * (1 - weight_v) + lower * weight_v
 
     def quadrature(self, spacing, band=1 << 20):
-        """Samples that integrate the map over the sphere, in bands of rows so that memory stays bounded.
+        """Samples that integrate the map over the sphere, in bands of rows so that memory stays
+        bounded.
 
-        Every pixel is split until its samples are no farther apart than `spacing`; radiance between the pixel
-        centres is bilinear, as Mitsuba evaluates it.
+        Every pixel is split until its samples are no farther apart than `spacing`; radiance between
+        the pixel centres is bilinear, as Mitsuba evaluates it.
 
         Parameters
         ----------
@@ -107,8 +116,9 @@ class EnvironmentMap:
             In sr; all bands together sum to 4π.
         radiance : (k, 3) float32
         """
-        # Pixels are nodes of a bilinear function. The intervals between them are split, so that no sample spans a kink
-        # and every sample's mean radiance is exact: at the middle in u, at the mean of v over the sphere in v.
+        # Pixels are nodes of a bilinear function. The intervals between them are split, so that no
+        # sample spans a kink and every sample's mean radiance is exact: at the middle in u, at the
+        # mean of v over the sphere in v.
         height, width, _ = self.pixels.shape
         intervals = max(height - 1, 1)
         splits_v = max(1, int(np.ceil(np.pi / intervals / spacing)))
@@ -123,7 +133,8 @@ class EnvironmentMap:
         for first in range(0, rows, step):
             row = np.arange(first, min(first + step, rows))
             first_theta, last_theta = row * (np.pi / rows), (row + 1) * (np.pi / rows)
-            # Exact solid angle of a latitude band, and the mean of θ over it: ∫ θ sin θ = sin θ − θ cos θ.
+            # Exact solid angle of a latitude band, and the mean of θ over it: ∫ θ sin θ = sin θ − θ
+            # cos θ.
             ring = np.cos(first_theta) - np.cos(last_theta)
             mean_theta = (_theta_moment(last_theta) - _theta_moment(first_theta)) / ring
             above = row // splits_v
@@ -131,7 +142,9 @@ class EnvironmentMap:
             weight_v = (mean_theta * (intervals / np.pi) - above).astype(np.float32)[:, None, None]
             lines = self.pixels[above] * (1 - weight_v) + self.pixels[below] * weight_v
             radiance = lines[:, left] * (1 - weight_u) + lines[:, right] * weight_u
-            vectors = np.sin(mean_theta)[:, None, None] * around + np.cos(mean_theta)[:, None, None] * np.array([0.0, 1.0, 0.0])
+            vectors = np.sin(mean_theta)[:, None, None] * around + np.cos(mean_theta)[
+                :, None, None
+            ] * np.array([0.0, 1.0, 0.0])
             vectors = (vectors.reshape(-1, 3) @ self.rotation.T).astype(np.float32)
             solid_angles = np.repeat(ring * (2 * np.pi / columns), columns).astype(np.float32)
             yield vectors, solid_angles, radiance.reshape(-1, 3).astype(np.float32)
@@ -165,7 +178,9 @@ def rotation_matrix(axis, degrees):
         raise LightError(f"rotation axis must be x, y, z or three numbers, got {axis!r}")
     length = np.linalg.norm(vector)
     if not (np.isfinite(length) and length > 0 and np.isfinite(degrees)):
-        raise LightError(f"rotation about {axis!r} by {degrees} degrees is not finite or has no axis")
+        raise LightError(
+            f"rotation about {axis!r} by {degrees} degrees is not finite or has no axis"
+        )
     x, y, z = vector / length
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     angle = np.deg2rad(float(degrees))
@@ -173,7 +188,9 @@ def rotation_matrix(axis, degrees):
 
 
 def orthonormal(matrix):
-    """The matrix as (3, 3) float64, after checking that it keeps lengths (a rotation or a reflection)."""
+    """The matrix as (3, 3) float64, after checking that it keeps lengths (a rotation or a
+    reflection).
+    """
     matrix = np.asarray(matrix, dtype=np.float64)
     if matrix.shape != (3, 3) or not np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-4):
         raise LightError("an environment's to_world must be a rotation without scale or shear")
@@ -191,7 +208,10 @@ def _read(source):
     try:
         return np.asarray(source)
     except ValueError:
-        raise LightError(f"an environment map is a path, an array (h, w, 3) or a mi.Bitmap, got {type(source).__name__}") from None
+        raise LightError(
+            "an environment map is a path, an array (h, w, 3) or a mi.Bitmap, got"
+            f" {type(source).__name__}"
+        ) from None
 
 
 def _read_exr(path):
@@ -201,12 +221,14 @@ def _read_exr(path):
         with OpenEXR.File(str(path), separate_channels=True) as file:
             channels = {name: channel.pixels for name, channel in file.channels().items()}
     except Exception as error:  # OpenEXR raises bare RuntimeErrors
-        raise LightError(f"environment map '{path}' cannot be read as OpenEXR: {_one_line(error)}") from None
+        raise LightError(
+            f"environment map '{path}' cannot be read as OpenEXR: {_one_line(error)}"
+        ) from None
     missing = [name for name in "RGB" if name not in channels]
     if missing:
         raise LightError(
-            f"environment map '{path}' has the channels {', '.join(sorted(channels)) or 'none'} and lacks "
-            f"{', '.join(missing)}: write it with R, G and B"
+            f"environment map '{path}' has the channels {', '.join(sorted(channels)) or 'none'} and"
+            f" lacks {', '.join(missing)}: write it with R, G and B"
         )
     return np.stack([channels[name] for name in "RGB"], axis=-1)
 
@@ -226,8 +248,13 @@ def _from_bitmap(bitmap):
 
     mi = mitsuba()
     if not isinstance(bitmap, mi.Bitmap):
-        raise LightError(f"an environment map is a path, an array (h, w, 3) or a mi.Bitmap, got {type(bitmap).__name__}")
-    return np.array(bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=False))
+        raise LightError(
+            "an environment map is a path, an array (h, w, 3) or a mi.Bitmap, got"
+            f" {type(bitmap).__name__}"
+        )
+    return np.array(
+        bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=False)
+    )
 
 
 def _validated(pixels, scale):
@@ -237,11 +264,14 @@ def _validated(pixels, scale):
         raise LightError(f"an environment map must hold real numbers, got {pixels.dtype}")
     if not np.isfinite(scale):
         raise LightError(f"an environment map's scale must be finite, got {scale}")
-    with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite, and is refused below
+    # what float32 cannot hold becomes infinite, and is refused below
+    with np.errstate(over="ignore"):
         pixels = pixels.astype(np.float32) * np.float32(scale)
     broken = int((~np.isfinite(pixels)).any(axis=2).sum())
     if broken:
-        raise LightError(f"environment map has {broken} pixels that are NaN or infinite: repair them first")
+        raise LightError(
+            f"environment map has {broken} pixels that are NaN or infinite: repair them first"
+        )
     negative = int((pixels < 0).any(axis=2).sum())
     if negative:
         sines = np.sin((np.arange(len(pixels)) + 0.5) * np.pi / len(pixels))[:, None, None]
@@ -250,8 +280,9 @@ def _validated(pixels, scale):
         share = lost / kept if kept > 0 else np.inf
         if share > NEGATIVE_ENERGY_LIMIT:
             raise LightError(
-                f"environment map has {negative} negative pixels with {share:.2g} of its energy, more than the "
-                f"{NEGATIVE_ENERGY_LIMIT:g} that compression can explain: repair it first"
+                f"environment map has {negative} negative pixels with {share:.2g} of its energy,"
+                f" more than the {NEGATIVE_ENERGY_LIMIT:g} that compression can explain: repair it"
+                " first"
             )
         warnings.warn(
             f"environment map: {negative} negative pixels ({share:.1g} of its energy) set to zero",

@@ -1,9 +1,10 @@
 """Light that turns fast: an environment kept on a fine direction lattice instead of its pixels.
 
-Eigentransport (section 5) rotates light by bilinear interpolation on the sampling lattice itself. That loses energy and
-blurs a small source anew at each turn. Here the light is averaged once over a lattice a few times finer than the
-asset's; a rotation turns the fine cells and averages them over the coarse ones with the same energy-exact rule as
-pixels (`cells.average`). The cost does not depend on the map's resolution.
+Eigentransport (section 5) rotates light by bilinear interpolation on the sampling lattice itself.
+That loses energy and blurs a small source anew at each turn. Here the light is averaged once over a
+lattice a few times finer than the asset's; a rotation turns the fine cells and averages them over
+the coarse ones with the same energy-exact rule as pixels (`cells.average`). The cost does not
+depend on the map's resolution.
 """
 
 from dataclasses import dataclass, replace
@@ -35,21 +36,29 @@ class LatticeMap:
     rotation: np.ndarray
 
     def rotated(self, axis, degrees):
-        """The same light turned about `axis` (x, y, z or a vector of 3) by `degrees`, right-handed."""
+        """The same light turned about `axis` (x, y, z or a vector of 3) by `degrees`,
+        right-handed.
+        """
         return replace(self, rotation=rotation_matrix(axis, degrees) @ self.rotation)
 
     @property
     def size(self):
-        """Rows and columns of an equirectangular map whose pixels are about as large as the cells."""
+        """Rows and columns of an equirectangular map whose pixels are about as large as the
+        cells.
+        """
         height = max(2, round(np.sqrt(np.pi / 4 * len(self.directions))))
         return height, 2 * height
 
     def at(self, vectors):
-        """Radiance (k, 3) that arrives from unit directions (k, 3) in world space: that of their cells."""
+        """Radiance (k, 3) that arrives from unit directions (k, 3) in world space: that of their
+        cells.
+        """
         return self.radiance[self.directions.cells(vectors @ self.rotation)]
 
     def quadrature(self, spacing):
-        """The cells as samples that cover the sphere, in one band; see `EnvironmentMap.quadrature`."""
+        """The cells as samples that cover the sphere, in one band; see
+        `EnvironmentMap.quadrature`.
+        """
         with one_blas_thread():
             vectors = self.directions.vectors @ self.rotation.T.astype(np.float32)
         yield vectors, self.directions.solid_angles.astype(np.float32), self.radiance
@@ -69,7 +78,8 @@ def on_lattice(light, directions, refinement=REFINEMENT):
     Returns
     -------
     Light
-        Whose `rotated` and projection take a few milliseconds. Directional and local lights are as they were.
+        Whose `rotated` and projection take a few milliseconds. Directional and local lights are as
+        they were.
     """
     light = as_light(light)
     if not light.maps:

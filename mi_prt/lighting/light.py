@@ -12,8 +12,8 @@ from .local_lights import AreaLight, PointLight, SpotLight
 from .values import direction, rgb
 
 KINDS = (
-    "an environment map (a path, an array (h, w, 3), a mi.Bitmap or EnvironmentMap), an AreaLight, SpotLight, DirectionalLight, "
-    "PointLight or Light"
+    "an environment map (a path, an array (h, w, 3), a mi.Bitmap or EnvironmentMap), an AreaLight,"
+    " SpotLight, DirectionalLight, PointLight or Light"
 )
 
 
@@ -42,13 +42,16 @@ class DirectionalLight:
         object.__setattr__(self, "irradiance", rgb("irradiance", self.irradiance))
 
     def rotated(self, axis, degrees):
-        """The same light turned about `axis` (x, y, z or a vector of 3) by `degrees`, right-handed."""
+        """The same light turned about `axis` (x, y, z or a vector of 3) by `degrees`,
+        right-handed.
+        """
         return DirectionalLight(rotation_matrix(axis, degrees) @ self.direction, self.irradiance)
 
 
 @dataclass(frozen=True, eq=False)
 class Light:
-    """The sum of any number of distant lights (maps and directionals) and local lights (all others).
+    """The sum of any number of distant lights (maps and directionals) and local lights (all
+    others).
 
     Parameters
     ----------
@@ -80,7 +83,9 @@ class Light:
 
     @property
     def is_empty(self):
-        """Whether it is the sum of no lights; `light.local.is_empty` tells that all of a light is distant."""
+        """Whether it is the sum of no lights; `light.local.is_empty` tells that all of a light is
+        distant.
+        """
         return not any(getattr(self, part.name) for part in fields(self))
 
     def rotated(self, axis, degrees):
@@ -110,8 +115,8 @@ def as_light(light):
 
     Parameters
     ----------
-    light : Light, or any light that it is the sum of, or path, (h, w, 3) array or mi.Bitmap, or list or tuple of these
-        A list is the sum of its entries, which may be lists themselves.
+    light : Light, or any light that it is the sum of, or path, (h, w, 3) array or mi.Bitmap
+        Or a list or tuple of these. A list is the sum of its entries, which may be lists themselves.
 
     Raises
     ------
@@ -130,4 +135,6 @@ def as_light(light):
     if not light:
         raise LightError("the list of lights is empty: pass one light at least")
     parts = [as_light(part) for part in light]
-    return Light(**{name: sum((getattr(part, name) for part in parts), ()) for name in _PARTS.values()})
+    return Light(
+        **{name: sum((getattr(part, name) for part in parts), ()) for name in _PARTS.values()}
+    )

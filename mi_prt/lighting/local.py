@@ -1,10 +1,12 @@
-"""Local lights: what arrives at each point from where, and whether that can be told from distant visibility.
+"""Local lights: what arrives at each point from where, and whether that can be told from distant
+visibility.
 
-Eigentransport, section 4.2.1: as seen from a point x, a local light at p is light from the lattice's direction nearest to
-p − x. The paper leaves its strength to a constant. Physically it is irradiance I/r² on a surface that faces the light, at
-the distance r = |p − x|, so that cell j has the radiance I/(r² w_j) and the irradiance of a surface is
-E = I/r² · T_j with T_j the transport of x from that cell. Transport knows what lies between x and infinity, not what lies
-between x and p: that is the same only where the light is outside the convex hull of the scene.
+Eigentransport, section 4.2.1: as seen from a point x, a local light at p is light from the
+lattice's direction nearest to p − x. The paper leaves its strength to a constant. Physically it is
+irradiance I/r² on a surface that faces the light, at the distance r = |p − x|, so that cell j has
+the radiance I/(r² w_j) and the irradiance of a surface is E = I/r² · T_j with T_j the transport of
+x from that cell. Transport knows what lies between x and infinity, not what lies between x and p:
+that is the same only where the light is outside the convex hull of the scene.
 """
 
 import numpy as np
@@ -17,8 +19,8 @@ NAMED_LIGHTS = 3  # places that a warning names
 def arrival(light, positions, directions, nearest=1):
     """Where a local light is seen from, and how strongly it shines there.
 
-    The irradiance of point i is E_i = irradiance_i · mean over its cells j of T_ij (Eigentransport eq. 4 with the cells'
-    radiance I/(k r² w_j)).
+    The irradiance of point i is E_i = irradiance_i · mean over its cells j of T_ij (Eigentransport
+    eq. 4 with the cells' radiance I/(k r² w_j)).
 
     Parameters
     ----------
@@ -34,8 +36,8 @@ def arrival(light, positions, directions, nearest=1):
     cells : (n, k) int64
         Indices of directions.
     irradiance : (n, 3) float32
-        I/r² in W/m², on a surface that faces the light; at most the largest float32. Zero at a point in which the light
-        stands: it has no direction there.
+        I/r² in W/m², on a surface that faces the light; at most the largest float32. Zero at a
+        point in which the light stands: it has no direction there.
 
     Raises
     ------
@@ -54,12 +56,22 @@ def arrival(light, positions, directions, nearest=1):
 
 
 def refuse_all_but_point_lights(light):
-    """Raise a LightError if a Light holds local lights that distant transport cannot be lit by: any but point lights."""
-    others = {"spot": light.spot_lights, "area": light.area_lights, "emission of the scene": light.emissions}
-    found = " and ".join(f"{len(lights)} {kind} light(s)" for kind, lights in others.items() if lights)
+    """Raise a LightError if a Light holds local lights that distant transport cannot be lit by: any
+    but point lights.
+    """
+    others = {
+        "spot": light.spot_lights,
+        "area": light.area_lights,
+        "emission of the scene": light.emissions,
+    }
+    found = " and ".join(
+        f"{len(lights)} {kind} light(s)" for kind, lights in others.items() if lights
+    )
     if found:
-        raise LightError(f"of local lights, transport of distant light takes point lights only, got {found}: precompute the "
-                         "scene with points='samples', or use point lights outside of it")
+        raise LightError(
+            f"of local lights, transport of distant light takes point lights only, got {found}:"
+            " precompute the scene with points='samples', or use point lights outside of it"
+        )
 
 
 def hull_warning(lights, hull):
@@ -81,5 +93,12 @@ def hull_warning(lights, hull):
         return None
     places = "; ".join("{:g}, {:g}, {:g}".format(*position) for position in inside[:NAMED_LIGHTS])
     places += "; …" if len(inside) > NAMED_LIGHTS else ""
-    who = f"the local light at {places} lies" if len(inside) == 1 else f"{len(inside)} local lights (at {places}) lie"
-    return f"{who} inside the convex hull of the scene, where visibility to infinity is not the visibility of the light"
+    who = (
+        f"the local light at {places} lies"
+        if len(inside) == 1
+        else f"{len(inside)} local lights (at {places}) lie"
+    )
+    return (
+        f"{who} inside the convex hull of the scene, where visibility to infinity is not the"
+        " visibility of the light"
+    )

@@ -8,9 +8,9 @@ from .light import DirectionalLight
 from .local_lights import AreaLight, PointLight, SpotLight
 
 FORMS = (
-    "scene (its own), point:x,y,z:r,g,b, spot:x,y,z:dx,dy,dz:r,g,b[:cutoff[:beam]] (direction of travel, degrees), "
-    "area:x,y,z:ux,uy,uz:vx,vy,vz:r,g,b[:samples] (centre, edges), directional:dx,dy,dz:r,g,b (direction of travel), "
-    "envmap:FILE or envmap:FILE:AXIS:DEGREES"
+    "scene (its own), point:x,y,z:r,g,b, spot:x,y,z:dx,dy,dz:r,g,b[:cutoff[:beam]] (direction of"
+    " travel, degrees), area:x,y,z:ux,uy,uz:vx,vy,vz:r,g,b[:samples] (centre, edges),"
+    " directional:dx,dy,dz:r,g,b (direction of travel), envmap:FILE or envmap:FILE:AXIS:DEGREES"
 )
 # Class, number of vectors before the strength, and the types of what may follow it.
 _NUMERIC = {
@@ -30,11 +30,14 @@ def parse_light(text):
     text : str
         - ``scene``: the scene's own light
         - ``point:x,y,z:r,g,b`` with the intensity in W/sr
-        - ``spot:x,y,z:dx,dy,dz:r,g,b``, then ``:cutoff`` and ``:beam`` in degrees if need be, with the direction in which the
+        - ``spot:x,y,z:dx,dy,dz:r,g,b``, then ``:cutoff`` and ``:beam`` in degrees if need be, with
+          the direction in which the
           light travels and the intensity in W/sr
-        - ``area:x,y,z:ux,uy,uz:vx,vy,vz:r,g,b``, then ``:samples`` if need be, with the centre, both edges, and the radiance in
+        - ``area:x,y,z:ux,uy,uz:vx,vy,vz:r,g,b``, then ``:samples`` if need be, with the centre,
+          both edges, and the radiance in
           W/(m² sr)
-        - ``directional:dx,dy,dz:r,g,b`` with the direction in which the light travels and the irradiance in W/m²
+        - ``directional:dx,dy,dz:r,g,b`` with the direction in which the light travels and the
+          irradiance in W/m²
         - ``envmap:FILE`` or ``envmap:FILE:AXIS:DEGREES``
 
         A single number in the place of r,g,b is grey.
@@ -88,7 +91,9 @@ def parse_rotation(text):
             raise ValueError
         return vector, float(degrees)
     except ValueError:
-        raise SettingsError(f"rotation '{text}' is not of the form AXIS:DEGREES, for example y:30 or 0,1,1:30") from None
+        raise SettingsError(
+            f"rotation '{text}' is not of the form AXIS:DEGREES, for example y:30 or 0,1,1:30"
+        ) from None
 
 
 def _numeric(light, vectors, options, parts):

@@ -1,4 +1,6 @@
-"""Emitting places in Dr.Jit: what each sends to where, read from memory, so that lights change without a new kernel."""
+"""Emitting places in Dr.Jit: what each sends to where, read from memory, so that lights change
+without a new kernel.
+"""
 
 import numpy as np
 
@@ -21,11 +23,17 @@ class Places:
         import drjit as dr
 
         mi = mitsuba()
-        columns = (emission.positions, emission.axes, emission.intensity, *(getattr(emission, x)[:, None] for x in ("cosine", "cutoff", "beam")))
+        columns = (
+            emission.positions,
+            emission.axes,
+            emission.intensity,
+            *(getattr(emission, x)[:, None] for x in ("cosine", "cutoff", "beam")),
+        )
         extra = np.empty((len(emission), 0)) if extra is None else extra
         self._loads = (_OWN + extra.shape[1]) // 4
         self._floats = mi.Float(np.hstack([*columns, extra]).astype(np.float32).ravel())
-        # Gathered, like all else: a number by itself compiles another kernel where its memory is aligned otherwise.
+        # Gathered, like all else: a number by itself compiles another kernel where its memory is
+        # aligned otherwise.
         self.count = dr.gather(mi.UInt32, mi.UInt32([len(emission), 0]), mi.UInt32(0))
 
     def sent(self, number, position):
@@ -47,12 +55,18 @@ class Places:
         import drjit as dr
 
         mi = mitsuba()
-        a, b, c, *extra = (dr.gather(mi.Vector4f, self._floats, self._loads * number + i) for i in range(self._loads))
+        a, b, c, *extra = (
+            dr.gather(mi.Vector4f, self._floats, self._loads * number + i)
+            for i in range(self._loads)
+        )
         toward = mi.Point3f(a.x, a.y, a.z) - position
         distance = dr.norm(toward)
         cosine = dr.select(distance > 0, -dr.dot(toward, mi.Vector3f(a.w, b.x, b.y)) / distance, 0)
         angle = dr.acos(dr.clip(cosine, -1, 1))
-        # Full intensity in the beam, then a fall that is linear in the angle; where beam and cutoff are equal there is no fall.
-        cone = dr.select(angle <= c.w, 1, dr.clip((c.z - angle) / dr.maximum(c.z - c.w, 1e-30), 0, 1))
+        # Full intensity in the beam, then a fall that is linear in the angle; where beam and cutoff
+        # are equal there is no fall.
+        cone = dr.select(
+            angle <= c.w, 1, dr.clip((c.z - angle) / dr.maximum(c.z - c.w, 1e-30), 0, 1)
+        )
         shape = cone * dr.select(c.y > 0, dr.maximum(cosine, 0), 1)
         return toward, mi.Color3f(b.z, b.w, c.x) * shape, extra

@@ -1,14 +1,16 @@
-"""Between Mitsuba's emitters and this program's light: the distant light of a scene, and a scene under other light.
+"""Between Mitsuba's emitters and this program's light: the distant light of a scene, and a scene
+under other light.
 
-Its local light is in `local_emitters`."""
+Its local light is in `local_emitters`.
+"""
 
 import numpy as np
 import scipy.ndimage
 
 from ..errors import LightError
-from ..system.runtime import mitsuba
 from ..scene.scene import is_dark, rebuilt_scene
 from ..scene.traversal import children, transform_of
+from ..system.runtime import mitsuba
 from .environment import EnvironmentMap
 from .light import DirectionalLight, Light, as_light
 from .local_emitters import local_scene_light
@@ -19,12 +21,14 @@ SKY_SAMPLES = 8  # samples of every pixel
 SUN_SAMPLES = 1 << 24  # samples shared by the pixels in which a sun was found
 MOST_SUN_SAMPLES = 1 << 16  # samples of one of them
 SUN_SEARCH = 1 << 16  # emitter samples that look for a sun
-SUM_REFINEMENT = 3  # of the grid on which unlike maps are summed; odd, so that its nodes hold those of the largest map
+# of the grid on which unlike maps are summed; odd, so that its nodes hold those of the largest map
+SUM_REFINEMENT = 3
 BAND = 1 << 20  # pixels resampled at a time
 
 
 def scene_light(scene):
-    """All distant light of a scene: `envmap`, `constant`, `sunsky`, `directional`, and any other distant emitter.
+    """All distant light of a scene: `envmap`, `constant`, `sunsky`, `directional`, and any other
+    distant emitter.
 
     Parameters
     ----------
@@ -40,7 +44,9 @@ def scene_light(scene):
         If the scene has no distant emitter, or one holds NaN, infinite or negative radiance.
     """
     if not scene.distant_emitters:
-        raise LightError("the scene has no distant light (envmap, constant, sunsky, directional): pass a light")
+        raise LightError(
+            "the scene has no distant light (envmap, constant, sunsky, directional): pass a light"
+        )
     return emitters_light(scene.distant_emitters)
 
 
@@ -62,10 +68,11 @@ def emitters_light(emitters):
 
 
 def lit_scene(mi_scene, light=None, keep_local=True):
-    """The same shapes and sensors as a new mi.Scene under other light, with watertight intersections.
+    """The same shapes and sensors as a new mi.Scene under other light, with watertight
+    intersections.
 
-    An area light becomes a rectangle that reflects nothing. It is a shape like others then: it blocks light, which
-    the area light of this program does not, and is seen in pictures.
+    An area light becomes a rectangle that reflects nothing. It is a shape like others then: it
+    blocks light, which the area light of this program does not, and is seen in pictures.
 
     Parameters
     ----------
@@ -73,8 +80,9 @@ def lit_scene(mi_scene, light=None, keep_local=True):
     light : what `as_light` accepts, optional
         Takes the place of the scene's distant emitters; by default they stay.
     keep_local : bool
-        Whether the scene's local emitters stay. Shapes stay in any case, and with them emitters on them: to leave out local
-        emitters, pass a scene in which those are dark, as `Scene.modelled` and `Scene.unlit` are.
+        Whether the scene's local emitters stay. Shapes stay in any case, and with them emitters on
+        them: to leave out local emitters, pass a scene in which those are dark, as `Scene.modelled`
+        and `Scene.unlit` are.
 
     Returns
     -------
@@ -83,8 +91,8 @@ def lit_scene(mi_scene, light=None, keep_local=True):
     Raises
     ------
     LightError
-        If the light has emissions (they stand for emitters of a scene, which are kept in it instead), or a shape shines
-        that should not.
+        If the light has emissions (they stand for emitters of a scene, which are kept in it
+        instead), or a shape shines that should not.
 
     Notes
     -----
@@ -94,11 +102,23 @@ def lit_scene(mi_scene, light=None, keep_local=True):
     kept = []
     for _, child in children(mi_scene):
         if isinstance(child, mi.Emitter):
-            stays = light is None if mi.has_flag(child.flags(), mi.EmitterFlags.Infinite) else keep_local
+            stays = (
+                light is None
+                if mi.has_flag(child.flags(), mi.EmitterFlags.Infinite)
+                else keep_local
+            )
         else:
             stays = isinstance(child, mi.Shape | mi.Sensor)
-            if isinstance(child, mi.Shape) and child.is_emitter() and not keep_local and not is_dark(child.emitter()):
-                raise LightError(f"shape '{child.id()}' shines: to leave out local light, pass what Scene.unlit or modelled gives")
+            if (
+                isinstance(child, mi.Shape)
+                and child.is_emitter()
+                and not keep_local
+                and not is_dark(child.emitter())
+            ):
+                raise LightError(
+                    f"shape '{child.id()}' shines: to leave out local light, pass what Scene.unlit"
+                    " or modelled gives"
+                )
         if stays:
             kept.append(child)
     return rebuilt_scene(kept, None if light is None else _emitters(as_light(light)))
@@ -110,7 +130,8 @@ def turned_light(scene, light=None, rotate=None):
     Parameters
     ----------
     scene : Scene or None
-        Whose own distant light is taken where `light` is None, or in the place of 'scene' in a list; not needed otherwise.
+        Whose own distant light is taken where `light` is None, or in the place of 'scene' in a
+        list; not needed otherwise.
     light : what `as_light` accepts, or a list of such and 'scene', optional
     rotate : (axis, degrees), optional
         Turns the distant light.
@@ -123,7 +144,9 @@ def turned_light(scene, light=None, rotate=None):
         What the asset is lit by.
     """
     if is_of_scene(light):
-        chosen = as_light([scene_light(scene) if is_of_scene(part) else part for part in _listed(light)])
+        chosen = as_light(
+            [scene_light(scene) if is_of_scene(part) else part for part in _listed(light)]
+        )
     else:
         chosen = as_light(light)
     if rotate is not None:
@@ -137,7 +160,8 @@ def chosen_local_light(scene, light=None):
     Parameters
     ----------
     scene : Scene or None
-        Whose own local light is taken where `light` is None, or in the place of 'scene' in a list; not needed otherwise.
+        Whose own local light is taken where `light` is None, or in the place of 'scene' in a list;
+        not needed otherwise.
     light : what `as_light` accepts, or a list of such and 'scene', optional
 
     Returns
@@ -156,7 +180,9 @@ def chosen_local_light(scene, light=None):
 
 
 def is_of_scene(light):
-    """Whether a light, as `turned_light` and `chosen_local_light` take it, contains the scene's own."""
+    """Whether a light, as `turned_light` and `chosen_local_light` take it, contains the scene's
+    own.
+    """
     return any(part is None or (isinstance(part, str) and part == SCENE) for part in _listed(light))
 
 
@@ -167,9 +193,10 @@ def _listed(light):
 def summed_maps(maps):
     """One map in place of several.
 
-    Maps of one size and rotation are summed pixel by pixel. Others are resampled to a grid three times finer than the
-    largest of them and turned like it. The largest is then kept exactly and constants are too; of the others, interpolation
-    changes the energy by 1e-5 in smooth maps, 4e-4 in noise, and up to 2 % in a sun of a single pixel.
+    Maps of one size and rotation are summed pixel by pixel. Others are resampled to a grid three
+    times finer than the largest of them and turned like it. The largest is then kept exactly and
+    constants are too; of the others, interpolation changes the energy by 1e-5 in smooth maps, 4e-4
+    in noise, and up to 2 % in a sun of a single pixel.
 
     Parameters
     ----------
@@ -181,14 +208,19 @@ def summed_maps(maps):
     """
     largest = max(maps, key=lambda environment: np.prod(environment.size))
     if all(_is_alike(environment, largest) for environment in maps):
-        return maps[0] if len(maps) == 1 else EnvironmentMap(sum(m.pixels for m in maps), largest.rotation)
+        return (
+            maps[0]
+            if len(maps) == 1
+            else EnvironmentMap(sum(m.pixels for m in maps), largest.rotation)
+        )
     height, width = largest.size
     height, width = SUM_REFINEMENT * max(height - 1, 1) + 1, SUM_REFINEMENT * width
     pixels = np.empty((height, width, 3), np.float32)
     step = max(1, BAND // width)
     for first in range(0, height, step):
         rows, columns = np.indices((min(step, height - first), width)).reshape(2, -1)
-        rows = np.clip(rows + first, 1e-6, height - 1 - 1e-6)  # beside a pole: in it, all columns would be one direction
+        # beside a pole: in it, all columns would be one direction
+        rows = np.clip(rows + first, 1e-6, height - 1 - 1e-6)
         vectors = _pixel_directions(rows, columns, height, width) @ largest.rotation.T
         pixels[first : first + step] = sum(m.at(vectors) for m in maps).reshape(-1, width, 3)
     return EnvironmentMap(pixels, largest.rotation)
@@ -197,13 +229,20 @@ def summed_maps(maps):
 def _is_alike(one, other):
     """Whether two maps have pixels in the same directions."""
     both_pixels = isinstance(one, EnvironmentMap) and isinstance(other, EnvironmentMap)
-    return both_pixels and one.size == other.size and np.allclose(one.rotation, other.rotation, rtol=0, atol=1e-9)
+    return (
+        both_pixels
+        and one.size == other.size
+        and np.allclose(one.rotation, other.rotation, rtol=0, atol=1e-9)
+    )
 
 
 def _emitters(light):
     """Mitsuba emitter dicts of a Light."""
     if light.emissions:
-        raise LightError("emission of a scene's own emitters has no emitter of its own: keep those of the scene, keep_local")
+        raise LightError(
+            "emission of a scene's own emitters has no emitter of its own: keep those of the scene,"
+            " keep_local"
+        )
     mi = mitsuba()
     emitters = {}
     if light.maps:
@@ -242,7 +281,9 @@ def point_emitter(light):
 def _spot_emitter(light):
     mi = mitsuba()
     aside = np.eye(3)[np.argmin(np.abs(light.direction))]
-    to_world = mi.ScalarTransform4f().look_at(list(light.position), list(light.position + light.direction), list(aside))
+    to_world = mi.ScalarTransform4f().look_at(
+        list(light.position), list(light.position + light.direction), list(aside)
+    )
     return {
         "type": "spot",
         "to_world": to_world,
@@ -254,7 +295,9 @@ def _spot_emitter(light):
 
 def _area_emitter(light):
     to_world = np.eye(4)
-    to_world[:3] = np.stack([light.edge_u / 2, light.edge_v / 2, light.normal, light.centre], axis=-1)
+    to_world[:3] = np.stack(
+        [light.edge_u / 2, light.edge_v / 2, light.normal, light.centre], axis=-1
+    )
     return {
         "type": "rectangle",
         "to_world": mitsuba().ScalarTransform4f(to_world),
@@ -278,25 +321,34 @@ def _environment_map(emitter):
     parameters = mi.traverse(emitter)
     data = np.array(parameters["data"])
     # Mitsuba pads the rows with a column at either end, for wrapping round.
-    return EnvironmentMap(data[:, 1:-1, :3], transform_of(emitter)[:3, :3], scale=float(np.array(parameters["scale"]).ravel()[0]))
+    return EnvironmentMap(
+        data[:, 1:-1, :3],
+        transform_of(emitter)[:3, :3],
+        scale=float(np.array(parameters["scale"]).ravel()[0]),
+    )
 
 
 def _baked(emitter):
-    """Any other emitter, averaged over the pixels of a map; pixels that hold a sun are sampled densely.
+    """Any other emitter, averaged over the pixels of a map; pixels that hold a sun are sampled
+    densely.
 
-    Samples that Mitsuba itself would take of the emitter tell where a sun is: those brighter than the map has them mark
-    pixels to refine, and so does contrast within a pixel.
+    Samples that Mitsuba itself would take of the emitter tell where a sun is: those brighter than
+    the map has them mark pixels to refine, and so does contrast within a pixel.
     """
     height, width = BAKED_HEIGHT, 2 * BAKED_HEIGHT
     every = np.indices((height, width)).reshape(2, -1).T
-    pixels, contrast = (x.reshape(height, width, -1) for x in _pixel_means(emitter, every, height, SKY_SAMPLES))
+    pixels, contrast = (
+        x.reshape(height, width, -1) for x in _pixel_means(emitter, every, height, SKY_SAMPLES)
+    )
     mi = mitsuba()
     side = int(SUN_SEARCH**0.5)
     grid = (np.indices((side, side)).reshape(2, -1) + 0.5) / side
     sample, weight = emitter.sample_direction(_origin(side * side), mi.Point2f(grid))
     direction = np.array(sample.d).T
     row, column = _pixel_of(direction, height)
-    brighter = (_rgb(weight) * np.array(sample.pdf)[:, None]).max(axis=1) > 1.5 * pixels[row, column].max(axis=1) + 1e-6
+    brighter = (_rgb(weight) * np.array(sample.pdf)[:, None]).max(axis=1) > 1.5 * pixels[
+        row, column
+    ].max(axis=1) + 1e-6
     marked = contrast[..., 0] > 1.5
     marked[row[brighter], column[brighter]] = True
     # A neighbour may hold the edge of what was found; around a pole all columns are neighbours.
@@ -314,10 +366,12 @@ def _baked(emitter):
 def _pixel_means(emitter, pixels, height, samples):
     """Mean radiance (k, 3) of the pixels (row, column).
 
-    Samples are weighted by the pixel's hat in bilinear interpolation: the interpolated map then has the emitter's energy,
-    at the poles too. Also the contrast (k, 1) within each pixel: its largest sample over its mean.
+    Samples are weighted by the pixel's hat in bilinear interpolation: the interpolated map then has
+    the emitter's energy, at the poles too. Also the contrast (k, 1) within each pixel: its largest
+    sample over its mean.
     """
-    # A golden-ratio lattice, all of whose samples have latitudes of their own: at a pole the edge of a sun runs along rows.
+    # A golden-ratio lattice, all of whose samples have latitudes of their own: at a pole the edge
+    # of a sun runs along rows.
     place = np.arange(samples) + 0.5
     offsets = 2 * np.stack([place / samples, place * (5**0.5 - 1) / 2 % 1], axis=-1) - 1
     sums, weights, largest = 0.0, 0.0, 0.0
@@ -336,7 +390,9 @@ def _pixel_means(emitter, pixels, height, samples):
 
 
 def _pixel_directions(rows, columns, height, width):
-    """Directions (…, 3) in which a map of a size shows some of its pixels, or places between them, in its own frame."""
+    """Directions (…, 3) in which a map of a size shows some of its pixels, or places between them,
+    in its own frame.
+    """
     theta = rows * (np.pi / (height - 1))
     phi = (columns + 0.5) * (2 * np.pi / width)
     sine = np.maximum(np.sin(theta), 0)  # beyond the poles there is nothing

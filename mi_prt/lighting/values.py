@@ -9,7 +9,9 @@ def rgb(what, value):
     """One number or three as (3,) float64, finite and not negative."""
     colour = numbers(value)
     if colour.shape not in ((), (3,)) or not is_finite(colour) or (colour < 0).any():
-        raise LightError(f"a light's {what} must be one or three finite float32 numbers ≥ 0, got {value}")
+        raise LightError(
+            f"a light's {what} must be one or three finite float32 numbers ≥ 0, got {value}"
+        )
     return np.broadcast_to(colour, 3).copy()
 
 

@@ -1,13 +1,16 @@
-"""Relit points and images as files. Each is written all or nothing: until it is whole, a file of that name stays."""
+"""Relit points and images as files.
+
+Each is written all or nothing: until it is whole, a file of that name stays.
+"""
 
 from pathlib import Path
 
 import numpy as np
 
 from ..errors import SettingsError
+from ..render.display import display, exposure
 from ..system.files import replacing
 from ..system.runtime import mitsuba
-from ..render.display import display, exposure
 
 PLY_TYPES = {"<f4": "float", "|u1": "uchar"}
 
@@ -15,10 +18,11 @@ PLY_TYPES = {"<f4": "float", "|u1": "uchar"}
 def write_ply(path, asset, radiance):
     """Write the points with their radiance as a binary PLY mesh.
 
-    Each vertex has x y z, nx ny nz, linear radiance as `radiance_r radiance_g radiance_b` (float), and for viewers
-    `red green blue` (uchar): the same exposed and sRGB encoded. The faces are those of the fronts; points on backs are
-    vertices without faces. Mitsuba reads the radiance as mesh attribute `vertex_radiance_color`, MeshLab and Blender
-    show red, green and blue. (Mitsuba reads these as well, as `vertex_color` in 0…255, with a warning about that.)
+    Each vertex has x y z, nx ny nz, linear radiance as `radiance_r radiance_g radiance_b` (float),
+    and for viewers `red green blue` (uchar): the same exposed and sRGB encoded. The faces are those
+    of the fronts; points on backs are vertices without faces. Mitsuba reads the radiance as mesh
+    attribute `vertex_radiance_color`, MeshLab and Blender show red, green and blue. (Mitsuba reads
+    these as well, as `vertex_color` in 0…255, with a warning about that.)
 
     Parameters
     ----------
@@ -43,10 +47,13 @@ def write_ply(path, asset, radiance):
     }.items():
         columns |= dict(zip(names, values.T))
     vertices = np.rec.fromarrays(
-        columns.values(), [(name, "<f4" if values.dtype == np.float32 else "u1") for name, values in columns.items()]
+        columns.values(),
+        [(name, "<f4" if values.dtype == np.float32 else "u1") for name, values in columns.items()],
     )
     triangles = points.patches.triangles()
-    faces = np.rec.fromarrays([np.full(len(triangles), 3), triangles], [("count", "u1"), ("vertices", "<i4", 3)])
+    faces = np.rec.fromarrays(
+        [np.full(len(triangles), 3), triangles], [("count", "u1"), ("vertices", "<i4", 3)]
+    )
     properties = [f"property {PLY_TYPES[vertices.dtype[name].str]} {name}" for name in columns]
     header = [
         "ply",
@@ -65,7 +72,8 @@ def write_ply(path, asset, radiance):
 
 
 def write_npz(path, asset, radiance, irradiance):
-    """Write the points as plain arrays: positions, normals, albedo, areas, triangles, irradiance and radiance.
+    """Write the points as plain arrays: positions, normals, albedo, areas, triangles, irradiance
+    and radiance.
 
     Parameters
     ----------
@@ -96,7 +104,8 @@ def write_npz(path, asset, radiance, irradiance):
 
 
 def write_image(path, radiance, factor=1.0):
-    """Write an image of linear radiance (h, w, 3): as it is to .exr (float32), displayed to .png (8 bits).
+    """Write an image of linear radiance (h, w, 3): as it is to .exr (float32), displayed to .png (8
+    bits).
 
     Parameters
     ----------

@@ -22,7 +22,8 @@ _NUMBER = re.compile(r"%0?(\d*)d")
 
 @dataclass(frozen=True, eq=False)
 class LightPath:
-    """A smooth path through key positions: the centripetal Catmull-Rom spline, which makes no loops of its own between them.
+    """A smooth path through key positions: the centripetal Catmull-Rom spline, which makes no loops
+    of its own between them.
 
     Parameters
     ----------
@@ -40,10 +41,16 @@ class LightPath:
     def __post_init__(self):
         keys = np.asarray(self.keys, np.float64)
         if keys.ndim != 2 or keys.shape[1] != 3 or len(keys) < 2 or not np.isfinite(keys).all():
-            raise SettingsError(f"a light path must be 2 or more finite positions, (k, 3), got {keys.shape}: {PATH_FORM}")
+            raise SettingsError(
+                f"a light path must be 2 or more finite positions, (k, 3), got {keys.shape}:"
+                f" {PATH_FORM}"
+            )
         still = np.flatnonzero((np.diff(keys, axis=0) == 0).all(axis=1))
         if len(still):
-            raise SettingsError(f"positions {still[0] + 1} and {still[0] + 2} of the light path are the same: leave one out")
+            raise SettingsError(
+                f"positions {still[0] + 1} and {still[0] + 2} of the light path are the same: leave"
+                " one out"
+            )
         object.__setattr__(self, "keys", keys)
 
     @property
@@ -54,8 +61,8 @@ class LightPath:
     def positions(self, frames):
         """Positions (frames, 3) float64 at equal steps of arc length.
 
-        They go from the first key to the last; on a closed path they stop one step before it, so that a film of them can be
-        played in a loop.
+        They go from the first key to the last; on a closed path they stop one step before it, so
+        that a film of them can be played in a loop.
 
         Raises
         ------
@@ -74,14 +81,20 @@ class LightPath:
         from scipy.interpolate import CubicHermiteSpline
 
         chords = np.diff(self.keys, axis=0)
-        steps = np.sqrt(np.linalg.norm(chords, axis=1))  # of the parameter: the root makes it centripetal
+        # of the parameter: the root makes it centripetal
+        steps = np.sqrt(np.linalg.norm(chords, axis=1))
         speeds, widths = chords / steps[:, None], steps[:, None]
-        before, after = (-1, 0) if self.closed else (0, -1)  # which piece comes before the first key, and after the last
+        # which piece comes before the first key, and after the last
+        before, after = (-1, 0) if self.closed else (0, -1)
         speeds = np.vstack([speeds[before], speeds, speeds[after]])
         widths = np.vstack([widths[before], widths, widths[after]])
-        tangents = (speeds[:-1] * widths[1:] + speeds[1:] * widths[:-1]) / (widths[:-1] + widths[1:])
+        tangents = (speeds[:-1] * widths[1:] + speeds[1:] * widths[:-1]) / (
+            widths[:-1] + widths[1:]
+        )
         knots = np.concatenate([[0], np.cumsum(steps)])
-        places = np.interp(np.arange(_STEPS * len(steps) + 1) / _STEPS, np.arange(len(knots)), knots)
+        places = np.interp(
+            np.arange(_STEPS * len(steps) + 1) / _STEPS, np.arange(len(knots)), knots
+        )
         return CubicHermiteSpline(knots, self.keys, tangents)(places)
 
 
@@ -99,7 +112,9 @@ def light_path(text):
     except ValueError:
         raise SettingsError(f"light path '{text}' is not understood: {PATH_FORM}") from None
     if any(len(key) != 3 for key in keys):
-        raise SettingsError(f"light path '{text}' has a position that is not of three numbers: {PATH_FORM}")
+        raise SettingsError(
+            f"light path '{text}' has a position that is not of three numbers: {PATH_FORM}"
+        )
     return LightPath(np.array(positions))
 
 
@@ -109,14 +124,22 @@ def check_frames_output(output, fps=25):
     suffix = output.suffix.lower()
     if suffix in VIDEOS:
         if not 0 < fps <= MAX_FPS[suffix]:
-            raise SettingsError(f"fps of {suffix} must be above 0 and at most {MAX_FPS[suffix]}, got {fps}")
+            raise SettingsError(
+                f"fps of {suffix} must be above 0 and at most {MAX_FPS[suffix]}, got {fps}"
+            )
         check_writable(output)
     elif suffix == ".png":
         if output.name.count("%") != 1 or not _NUMBER.search(output.name):
-            raise SettingsError(f"output '{output}' needs a place for each frame's number: name it like 'frame-%03d.png'")
+            raise SettingsError(
+                f"output '{output}' needs a place for each frame's number: name it like"
+                " 'frame-%03d.png'"
+            )
         check_writable(_numbered(output, 0))
     else:
-        raise SettingsError(f"output '{output}' must end in {', '.join(VIDEOS)}, or be numbered like 'frame-%03d.png'")
+        raise SettingsError(
+            f"output '{output}' must end in {', '.join(VIDEOS)}, or be numbered like"
+            " 'frame-%03d.png'"
+        )
 
 
 def write_frames(output, frames: Iterable, fps=25):
@@ -125,8 +148,9 @@ def write_frames(output, frames: Iterable, fps=25):
     Parameters
     ----------
     output : path
-        .mp4 (H.264) or .gif (256 colours for each frame, dithered, played in a loop): written all or nothing. Or .png with
-        a number, like 'frame-%03d.png': one file for each frame from 0 on, each written all or nothing.
+        .mp4 (H.264) or .gif (256 colours for each frame, dithered, played in a loop): written all
+        or nothing. Or .png with a number, like 'frame-%03d.png': one file for each frame from 0 on,
+        each written all or nothing.
     frames : iterable of (h, w, 3)
         Displayed values 0…1, all of one size.
     fps : number
@@ -140,11 +164,12 @@ def write_frames(output, frames: Iterable, fps=25):
     Raises
     ------
     SettingsError
-        If the name is of another kind or cannot be written, if there is no frame, one is of another size, or `fps` is out of range.
+        If the name is of another kind or cannot be written, if there is no frame, one is of another
+        size, or `fps` is out of range.
 
     Notes
-    -----
-    H.264 needs an even width and height: the last row or column is repeated. A quarter of the resolution carries colour.
+    ----- H.264 needs an even width and height: the last row or column is repeated. A quarter of the
+    resolution carries colour.
     """
     check_frames_output(output, fps)
     output, images = Path(output), _images(frames)
@@ -159,12 +184,16 @@ def write_frames(output, frames: Iterable, fps=25):
 
 
 def _images(frames):
-    """The same frames, one at a time; SettingsError for none, or for one of another size than the first."""
+    """The same frames, one at a time; SettingsError for none, or for one of another size than the
+    first.
+    """
     shape = None
     for image in frames:
         shape = shape or np.shape(image)
         if np.shape(image) != shape or len(shape) != 3 or shape[2] != 3:
-            raise SettingsError(f"frames must all be of one shape (h, w, 3), got {np.shape(image)} after {shape}")
+            raise SettingsError(
+                f"frames must all be of one shape (h, w, 3), got {np.shape(image)} after {shape}"
+            )
         yield image
     if shape is None:
         raise SettingsError("there is no frame to write: ask for one or more")
@@ -189,9 +218,15 @@ def _write_mp4(path, images, fps):
         codec.color_primaries, codec.color_trc = ColorPrimaries.BT709, ColorTrc.IEC61966_2_1
         count = 0
         for count, image in enumerate(chain([first], map(to_8bit, images)), 1):
-            image = np.pad(image, [(0, height - image.shape[0]), (0, width - image.shape[1]), (0, 0)], mode="edge")
+            image = np.pad(
+                image,
+                [(0, height - image.shape[0]), (0, width - image.shape[1]), (0, 0)],
+                mode="edge",
+            )
             frame = av.VideoFrame.from_ndarray(image, format="rgb24")
-            frame = frame.reformat(format="yuv420p", dst_colorspace=Colorspace.ITU709, dst_color_range=ColorRange.MPEG)
+            frame = frame.reformat(
+                format="yuv420p", dst_colorspace=Colorspace.ITU709, dst_color_range=ColorRange.MPEG
+            )
             file.mux(stream.encode(frame))
         file.mux(stream.encode())
         return count
@@ -205,7 +240,10 @@ def _write_gif(path, images, fps):
     graph = av.filter.Graph()  # a palette for each frame, so that no two frames must be in memory
     source = graph.add_buffer(width=width, height=height, format="rgb24", time_base=1 / fps)
     copies, sink = graph.add("split"), graph.add("buffersink")
-    palette, applied = graph.add("palettegen", "stats_mode=single"), graph.add("paletteuse", "new=1")
+    palette, applied = (
+        graph.add("palettegen", "stats_mode=single"),
+        graph.add("paletteuse", "new=1"),
+    )
     source.link_to(copies)
     copies.link_to(palette, 0, 0)
     copies.link_to(applied, 1, 0)

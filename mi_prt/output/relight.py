@@ -4,19 +4,19 @@ import time
 import warnings
 from pathlib import Path
 
+from ..asset.meshless_asset import MeshlessAsset
+from ..asset.provenance import open_scene_of
 from ..errors import SceneError, SettingsError
 from ..evaluate.local_lights import measure_error
-from ..system.files import check_writable
 from ..lighting.environment import LightWarning
 from ..lighting.local import hull_warning
 from ..lighting.scene_light import is_of_scene, lit_scene, turned_light
-from ..asset.meshless_asset import MeshlessAsset
-from ..asset.provenance import open_scene_of
-from .relight_local import IMAGES, MESHES, relight_local
 from ..render.display import exposure
-from .export import write_image, write_npz, write_ply
 from ..render.image import pick_sensor, render_image, resized
 from ..scene.scene import Scene
+from ..system.files import check_writable
+from .export import write_image, write_npz, write_ply
+from .relight_local import IMAGES, MESHES, relight_local
 
 RENDERERS = ("mitsuba", "raster")
 
@@ -43,7 +43,8 @@ def relight_to_file(
     output : path
         .exr (linear) or .png (exposed, sRGB) image; .ply or .npz of the points.
     light : what `as_light` accepts, or a list of such and 'scene', optional
-        By default 'scene': the scene's own distant light, or its local light if the asset is one of local lights.
+        By default 'scene': the scene's own distant light, or its local light if the asset is one of
+        local lights.
     rotate : (axis, degrees), optional
         Turns the distant light.
     scene : path, dict or mi.Scene, optional
@@ -55,18 +56,21 @@ def relight_to_file(
     spp : int
         Samples per pixel of the integrator.
     nearest : int
-        Directions that stand for a local light in an asset of distant light, see `Asset.irradiance`.
+        Directions that stand for a local light in an asset of distant light, see
+        `Asset.irradiance`.
     component : 'total', 'direct' or 'indirect'
         Of an asset of local lights, what is shown.
     direct : 'points' or 'pixels'
-        Of an asset of local lights, where direct light is computed: at the points, or with shadow rays at each pixel.
+        Of an asset of local lights, where direct light is computed: at the points, or with shadow
+        rays at each pixel.
 
     Returns
     -------
     dict
-        points, seconds{project, relight, render}. With local lights, and where the scene is opened, which it is for images
-        and if one of them is inside its convex hull: local_light_error{relative_rmse, bias, points}, the error of their
-        irradiance against Mitsuba's.
+        points, seconds{project, relight, render}. With local lights, and where the scene is opened,
+        which it is for images and if one of them is inside its convex hull:
+        local_light_error{relative_rmse, bias, points}, the error of their irradiance against
+        Mitsuba's.
 
     Raises
     ------
@@ -79,12 +83,17 @@ def relight_to_file(
     """
     if isinstance(asset, MeshlessAsset):
         if rotate is not None or nearest != 1:
-            raise SettingsError("rotate and nearest are for distant light, and this asset is one of local lights (points='samples')")
-        return relight_local(asset, output, light, scene, sensor, size, renderer, spp, component, direct)
+            raise SettingsError(
+                "rotate and nearest are for distant light, and this asset is one of local lights"
+                " (points='samples')"
+            )
+        return relight_local(
+            asset, output, light, scene, sensor, size, renderer, spp, component, direct
+        )
     if (component, direct) != ("total", "points"):
         raise SettingsError(
-            f"component '{component}', direct '{direct}': an asset of distant light holds all light in one; precompute the scene with "
-            "points='samples' to tell them apart"
+            f"component '{component}', direct '{direct}': an asset of distant light holds all light"
+            " in one; precompute the scene with points='samples' to tell them apart"
         )
     output = Path(output)
     suffix = output.suffix.lower()
@@ -122,20 +131,31 @@ def relight_to_file(
         write_image(output, image, factor)
     clock.append(time.perf_counter())
     stages = zip(("project", "relight", "render"), clock, clock[1:])
-    result = {"points": len(asset.points), "seconds": {name: round(b - a, 5) for name, a, b in stages}}
+    result = {
+        "points": len(asset.points),
+        "seconds": {name: round(b - a, 5) for name, a, b in stages},
+    }
     if chosen.point_lights:
         result |= _local_light_error(asset, chosen.point_lights, nearest, opened, scene)
     return result
 
 
 def _local_light_error(asset, lights, nearest, opened, scene):
-    """The entry local_light_error, or none where the scene is neither open nor needed, or not to be had."""
+    """The entry local_light_error, or none where the scene is neither open nor needed, or not to be
+    had.
+    """
     warning = hull_warning(lights, asset.points.hull)
     if opened is None and not warning:
         return {}
     try:
-        return {"local_light_error": measure_error(asset, lights, nearest, opened or open_scene_of(asset, scene))}
+        return {
+            "local_light_error": measure_error(
+                asset, lights, nearest, opened or open_scene_of(asset, scene)
+            )
+        }
     except SceneError as error:
         warning = f"{warning}; by" if warning else "local lights: by"
-        warnings.warn(f"{warning} how much it errs cannot be measured: {error}", LightWarning, stacklevel=3)
+        warnings.warn(
+            f"{warning} how much it errs cannot be measured: {error}", LightWarning, stacklevel=3
+        )
         return {}

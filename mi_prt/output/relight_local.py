@@ -7,19 +7,19 @@ from pathlib import Path
 
 import numpy as np
 
+from ..asset.meshless_asset import COMPONENTS
+from ..asset.provenance import open_scene_of
 from ..errors import LightError, SettingsError
-from ..system.files import check_writable
 from ..lighting.emission import emission_of
 from ..lighting.light import Light, as_light
 from ..lighting.scene_light import chosen_local_light, is_of_scene, lit_scene
-from ..asset.meshless_asset import COMPONENTS
-from ..asset.provenance import open_scene_of
-from .film import check_frames_output, write_frames
 from ..render.display import display, exposure
-from .export import write_image, write_npz, write_ply
 from ..render.image import pick_sensor, render_image, resized
 from ..render.integrator import DIRECT
 from ..scene.scene import Scene
+from ..system.files import check_writable
+from .export import write_image, write_npz, write_ply
+from .film import check_frames_output, write_frames
 
 IMAGES = (".exr", ".png")
 MESHES = (".ply", ".npz")
@@ -53,7 +53,11 @@ def relight_local(
         irradiance = asset.irradiance(light, component)
         relit = time.perf_counter()
         radiance = asset.outgoing_radiance(irradiance)
-        write_ply(output, asset, radiance) if suffix == ".ply" else write_npz(output, asset, radiance, irradiance)
+        (
+            write_ply(output, asset, radiance)
+            if suffix == ".ply"
+            else write_npz(output, asset, radiance, irradiance)
+        )
     else:
         shown = LocalPicture(asset, open_scene_of(asset, scene), light, component, direct)
         started = time.perf_counter()
@@ -62,7 +66,10 @@ def relight_local(
         with shown.drawn(sensor, size, renderer, spp) as image:
             picture = image(irradiance)
         write_image(output, picture, exposure(asset.outgoing_radiance(shown.at_points())))
-    seconds = {"relight": round(relit - started, 5), "render": round(time.perf_counter() - relit, 5)}
+    seconds = {
+        "relight": round(relit - started, 5),
+        "render": round(time.perf_counter() - relit, 5),
+    }
     return {"points": len(asset.points), "seconds": seconds}
 
 
@@ -132,7 +139,11 @@ def animate_local(
                     yield display(picture, factor)
 
     write_frames(output, pictures(), fps)
-    return {"points": len(asset.points), "frames": frames, "seconds": {k: round(v, 5) for k, v in seconds.items()}}
+    return {
+        "points": len(asset.points),
+        "frames": frames,
+        "seconds": {k: round(v, 5) for k, v in seconds.items()},
+    }
 
 
 class LocalPicture:
@@ -187,17 +198,23 @@ class LocalPicture:
     def _image(self, lit, camera, spp, irradiance):
         """Image (h, w, 3) by the integrator."""
         places = emission_of(self._chosen) if self._at_pixels else None
-        return render_image(self._asset, lit.mi_scene, camera, spp, irradiance=irradiance, pixel_light=places)
+        return render_image(
+            self._asset, lit.mi_scene, camera, spp, irradiance=irradiance, pixel_light=places
+        )
 
     def _splats(self, lit, camera, samples):
         """SplatScene of the samples."""
         if self._at_pixels:
-            raise SettingsError("direct light at pixels needs the renderer mitsuba, splats show that of the points")
+            raise SettingsError(
+                "direct light at pixels needs the renderer mitsuba, splats show that of the points"
+            )
         from ..render.splats import SplatScene  # opens OpenGL: only where it is asked for
 
         samples_of = self._asset.samples
         radii = np.full(len(samples_of), SPLAT_RADII * samples_of.radius, np.float32)
-        return SplatScene(self._asset.points.positions, self._asset.points.normals, radii, lit, camera, samples)
+        return SplatScene(
+            self._asset.points.positions, self._asset.points.normals, radii, lit, camera, samples
+        )
 
 
 def _check(component, direct, renderer):
@@ -224,9 +241,14 @@ def _moving(light):
     light = as_light(light) if light is not None else Light()
     kind = next((kind for kind in _PLACES if getattr(light, kind)), None)
     if kind is None:
-        raise LightError("a light path moves the first point, spot or area light that is given: pass one (--light point:0,0,0:r,g,b)")
+        raise LightError(
+            "a light path moves the first point, spot or area light that is given: pass one"
+            " (--light point:0,0,0:r,g,b)"
+        )
     first, *others = getattr(light, kind)
-    return lambda place: replace(light, **{kind: (replace(first, **{_PLACES[kind]: place}), *others)})
+    return lambda place: replace(
+        light, **{kind: (replace(first, **{_PLACES[kind]: place}), *others)}
+    )
 
 
 def _moves_a_shape(light):

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from ..system.runtime import mitsuba
 from ..scene.materials import facing
+from ..system.runtime import mitsuba
 from .locate import PatchLocator
 
 _LEAST_KEPT = 1e-4  # weight of the points around a hit that are not buried, below which all count
@@ -51,7 +51,10 @@ class PatchInterpolator:
         sum_kept = sum(kept)
         usable = sum_kept > _LEAST_KEPT
         shares = [dr.select(usable, k / sum_kept, w) for k, w in zip(kept, weights)]
-        return sum(w * dr.gather(mi.Color3f, values, p, found) for p, w in zip(points, shares)), found
+        return (
+            sum(w * dr.gather(mi.Color3f, values, p, found) for p, w in zip(points, shares)),
+            found,
+        )
 
 
 class SampleInterpolator:

@@ -1,9 +1,11 @@
-"""Patches: regular lattices of points over mesh faces and over the (u, v) domain of analytic shapes.
+"""Patches: regular lattices of points over mesh faces and over the (u, v) domain of analytic
+shapes.
 
-A patch is either a triangle of level k, whose nodes (i, j), i + j ≤ k, have the barycentric coordinates
-(1 − (i + j)/k, i/k, j/k), or a rectangle of levels (k_u, k_v), whose nodes lie at (i/k_u, j/k_v). Nodes are numbered
-row by row in j. A hit's position on its face therefore gives the three points around it in closed form, with no
-search: `Patches.triangles` and `locate.PatchLocator` use the same numbering.
+A patch is either a triangle of level k, whose nodes (i, j), i + j ≤ k, have the barycentric
+coordinates (1 − (i + j)/k, i/k, j/k), or a rectangle of levels (k_u, k_v), whose nodes lie at
+(i/k_u, j/k_v). Nodes are numbered row by row in j. A hit's position on its face therefore gives the
+three points around it in closed form, with no search: `Patches.triangles` and `locate.PatchLocator`
+use the same numbering.
 """
 
 from dataclasses import dataclass
@@ -13,7 +15,8 @@ import numpy as np
 
 @dataclass(frozen=True, eq=False)
 class Patches:
-    """The patches of a point set, one per mesh face or analytic shape, in the order of surfaces and faces.
+    """The patches of a point set, one per mesh face or analytic shape, in the order of surfaces and
+    faces.
 
     Parameters
     ----------
@@ -24,7 +27,8 @@ class Patches:
     nodes : (t,) int32
         Index of the point at every node.
     back : (p,) int32
-        Added to a point's index gives the point on the back of the surface; 0 where the back does not reflect.
+        Added to a point's index gives the point on the back of the surface; 0 where the back does
+        not reflect.
     """
 
     levels: np.ndarray
@@ -46,7 +50,9 @@ class Patches:
 
 def node_count(levels_u, levels_v):
     """Number of nodes of patches of these levels; arrays or scalars."""
-    return np.where(levels_v == 0, (levels_u + 1) * (levels_u + 2) // 2, (levels_u + 1) * (levels_v + 1))
+    return np.where(
+        levels_v == 0, (levels_u + 1) * (levels_u + 2) // 2, (levels_u + 1) * (levels_v + 1)
+    )
 
 
 def lattice_nodes(level_u, level_v):

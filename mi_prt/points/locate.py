@@ -3,9 +3,9 @@
 import numpy as np
 
 from ..errors import SceneError
-from ..system.runtime import mitsuba
 from ..scene.scene import mesh_arrays
 from ..scene.surface_table import SurfaceTable
+from ..system.runtime import mitsuba
 from .tessellate import TESSELLATED_SHAPES
 
 NO_PATCH = 0xFFFFFFFF
@@ -14,9 +14,10 @@ NO_PATCH = 0xFFFFFFFF
 class PatchLocator:
     """Finds the points around surface hits of one Mitsuba scene.
 
-    The scene may be organised otherwise than the one the points were made from: Mitsuba's loader merges meshes that
-    share a material by default. Mesh faces are therefore matched by the positions of their corners, analytic shapes by
-    their place in the world, once, when the locator is made.
+    The scene may be organised otherwise than the one the points were made from: Mitsuba's loader
+    merges meshes that share a material by default. Mesh faces are therefore matched by the
+    positions of their corners, analytic shapes by their place in the world, once, when the locator
+    is made.
 
     Parameters
     ----------
@@ -50,7 +51,11 @@ class PatchLocator:
                 starts.append(NO_PATCH)
                 continue
             known = surface.kind != "mesh"
-            patch = np.array([analytic.get(surface.signature, NO_PATCH)]) if known else faces.take(surface)
+            patch = (
+                np.array([analytic.get(surface.signature, NO_PATCH)])
+                if known
+                else faces.take(surface)
+            )
             missing = int((patch == NO_PATCH).sum())
             if missing:
                 raise SceneError(
@@ -101,7 +106,8 @@ class PatchLocator:
         columns = dr.maximum(dr.select(triangle, level_u - j, level_u), 1)
         i = dr.minimum(mi.UInt32(x), columns - 1)
         fx, fy = dr.clip(x - mi.Float(i), 0, 1), dr.clip(y - mi.Float(j), 0, 1)
-        # In the last small triangle of a row there is no upper half; rounding can put a hit just across.
+        # In the last small triangle of a row there is no upper half; rounding can put a hit just
+        # across.
         upper = (fx + fy > 1) & ~(triangle & (i + 1 == columns))
         outside = dr.maximum(fx + fy, 1)
         fx, fy = dr.select(upper, fx, fx / outside), dr.select(upper, fy, fy / outside)
@@ -142,31 +148,49 @@ class _FaceIndex:
         keys = _corner_keys(points.positions[patches.nodes[corners]])
         order = np.argsort(keys)
         self._keys, self._patches = keys[order], is_triangle[order]
-        self._taken = np.zeros(len(keys), np.int64)  # at the first of equal keys: how many were given out
-        self._flipped = np.repeat([s["flipped"] for s in points.surfaces], [s["patches"] for s in points.surfaces])
+        # at the first of equal keys: how many were given out
+        self._taken = np.zeros(len(keys), np.int64)
+        self._flipped = np.repeat(
+            [s["flipped"] for s in points.surfaces], [s["patches"] for s in points.surfaces]
+        )
 
     def take(self, surface):
-        """Patch (f,) of each face of a mesh; NO_PATCH where there is none. Faces of zero area match anything.
+        """Patch (f,) of each face of a mesh; NO_PATCH where there is none. Faces of zero area match
+        anything.
 
-        Coincident faces have equal keys: the k-th of them in the scene takes the k-th of the points'.
+        Coincident faces have equal keys: the k-th of them in the scene takes the k-th of the
+        points'.
         """
         positions, faces, _, _ = mesh_arrays(surface.shape)
-        world = (positions.astype(np.float64) @ surface.to_world[:3, :3].T + surface.to_world[:3, 3]).astype(np.float32)
+        world = (
+            positions.astype(np.float64) @ surface.to_world[:3, :3].T + surface.to_world[:3, 3]
+        ).astype(np.float32)
         corners = world[faces]
         keys = _corner_keys(corners)
         order = np.argsort(keys, kind="stable")
         ordered = keys[order]
         repeat = np.empty(len(keys), np.int64)
         repeat[order] = np.arange(len(keys)) - np.searchsorted(ordered, ordered)
-        low, high = np.searchsorted(self._keys, keys), np.searchsorted(self._keys, keys, side="right")
+        low, high = (
+            np.searchsorted(self._keys, keys),
+            np.searchsorted(self._keys, keys, side="right"),
+        )
         known = high > low
         patch = np.full(len(keys), NO_PATCH)
         place = low[known] + repeat[known] + self._taken[low[known]]
         patch[known] = self._patches[np.minimum(place, high[known] - 1)]
         np.add.at(self._taken, low[known], 1)
-        patch[known] = np.where(self._flipped[patch[known]] == surface.shape.has_flipped_normals(), patch[known], NO_PATCH)
-        doubled = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-        return np.where(~known & (doubled <= 1e-10 * max(doubled.max(initial=0.0), 1e-300)), 0, patch)
+        patch[known] = np.where(
+            self._flipped[patch[known]] == surface.shape.has_flipped_normals(),
+            patch[known],
+            NO_PATCH,
+        )
+        doubled = np.linalg.norm(
+            np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+        )
+        return np.where(
+            ~known & (doubled <= 1e-10 * max(doubled.max(initial=0.0), 1e-300)), 0, patch
+        )
 
 
 def _corner_keys(corners):

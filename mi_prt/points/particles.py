@@ -1,9 +1,12 @@
-"""What light can reach: particles that bounce through a scene, and random lines that measure its surfaces.
+"""What light can reach: particles that bounce through a scene, and random lines that measure its
+surfaces.
 
-Particles leave the sensors and local emitters and are reflected diffusely again and again (Meshless PRT, section 4.1). In a closed room
-that process ends in equal density on all surfaces, and its flights fill the space evenly: hits are candidates for sample points, places
-on flights candidates for lights. Random lines of equal density in space and direction (Cauchy and Crofton) meet any surface in proportion
-to its area, whatever kind of shape it is: that gives areas without tessellation.
+Particles leave the sensors and local emitters and are reflected diffusely again and again (Meshless
+PRT, section 4.1). In a closed room that process ends in equal density on all surfaces, and its
+flights fill the space evenly: hits are candidates for sample points, places on flights candidates
+for lights. Random lines of equal density in space and direction (Cauchy and Crofton) meet any
+surface in proportion to its area, whatever kind of shape it is: that gives areas without
+tessellation.
 """
 
 from dataclasses import dataclass, fields
@@ -11,9 +14,9 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from ..errors import SceneError
-from ..system.runtime import mitsuba
 from ..scene.materials import facing, reflectance_at
 from ..scene.surface_table import SurfaceTable
+from ..system.runtime import mitsuba
 
 PARTICLES = 1 << 14  # on their way at a time
 STEPS = 64  # hits of each
@@ -58,7 +61,12 @@ class Hits:
     @classmethod
     def joined(cls, parts):
         """All hits of a sequence of Hits."""
-        return cls(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(cls)))
+        return cls(
+            *(
+                np.concatenate([getattr(part, field.name) for part in parts])
+                for field in fields(cls)
+            )
+        )
 
 
 def trace_particles(scene, count, seed=0):
@@ -90,24 +98,44 @@ def trace_particles(scene, count, seed=0):
     offset = dr.opaque(mi.Float, _OFFSET * scene.scale)
     hits, flights, found = [], [], 0
     for run in range(_MOST_RUNS):
-        random = mi.PCG32(size=PARTICLES, initstate=mi.UInt64(dr.opaque(mi.UInt32, seed + 7919 * run)))
+        random = mi.PCG32(
+            size=PARTICLES, initstate=mi.UInt64(dr.opaque(mi.UInt32, seed + 7919 * run))
+        )
         pool = _source_rays(scene, PARTICLES * STEPS, seed + 7919 * run)
         kept = _Kept(PARTICLES * STEPS)
         lane = dr.arange(mi.UInt32, PARTICLES)
 
         def step(number, origin, direction, alive, random):
-            fresh = [dr.gather(mi.Vector3f, rays, number * PARTICLES + lane, ~alive) for rays in pool]
-            ray = mi.Ray3f(dr.select(alive, origin, fresh[0]), dr.select(alive, direction, fresh[1]))
+            fresh = [
+                dr.gather(mi.Vector3f, rays, number * PARTICLES + lane, ~alive) for rays in pool
+            ]
+            ray = mi.Ray3f(
+                dr.select(alive, origin, fresh[0]), dr.select(alive, direction, fresh[1])
+            )
             si = scene.occluders.ray_intersect(ray)
             normals, si.wi, reflects = facing(si, ray, scene.surfaces)
             # Off an edge a ray can start beyond the other wall, and meet the outer side of that.
             met = si.is_valid() & reflects & (si.t > offset)
             end = dr.select(si.is_valid(), si.p, ray(box.leave(ray)))
             kept.write(number * PARTICLES + lane, scene, table, si, normals, met, ray.o, end)
-            cosine = mi.warp.square_to_cosine_hemisphere(mi.Point2f(random.next_float32(), random.next_float32()))
-            return number + 1, mi.Point3f(si.p + offset * normals.geometric), mi.Frame3f(normals.geometric).to_world(cosine), met, random
+            cosine = mi.warp.square_to_cosine_hemisphere(
+                mi.Point2f(random.next_float32(), random.next_float32())
+            )
+            return (
+                number + 1,
+                mi.Point3f(si.p + offset * normals.geometric),
+                mi.Frame3f(normals.geometric).to_world(cosine),
+                met,
+                random,
+            )
 
-        start = (dr.opaque(mi.UInt32, 0), mi.Point3f(0), mi.Vector3f(0, 0, 1), dr.opaque(mi.Bool, False), random)
+        start = (
+            dr.opaque(mi.UInt32, 0),
+            mi.Point3f(0),
+            mi.Vector3f(0, 0, 1),
+            dr.opaque(mi.Bool, False),
+            random,
+        )
         dr.while_loop(start, lambda number, *_: number < STEPS, step)
         block, flown = kept.read(WARM_UP * PARTICLES)
         hits.append(block)
@@ -118,7 +146,8 @@ def trace_particles(scene, count, seed=0):
         if not found:
             break
     raise SceneError(
-        f"particles from the scene's sensors and local emitters find {found:,} places on surfaces that reflect, too few for {count:,}"
+        f"particles from the scene's sensors and local emitters find {found:,} places on surfaces"
+        f" that reflect, too few for {count:,}"
     )
 
 
@@ -175,39 +204,65 @@ def cross_surfaces(scene, centre, radius, seed=0):
                 return number + 1, mi.Point3f(si.p + offset * line.d), active
 
             state = (dr.opaque(mi.UInt32, 0), origin, active)
-            _, origin, active = dr.while_loop(state, lambda number, origin, active: active & (number < CROSSINGS), step)
+            _, origin, active = dr.while_loop(
+                state, lambda number, origin, active: active & (number < CROSSINGS), step
+            )
             parts.append(kept.read()[0])
         yield Hits.joined(parts), 4 * np.pi * radius**2 / LINES
         block += 1
 
 
 def _source_rays(scene, count, seed):
-    """Origins and directions (flat mi.Float) of so many rays that leave the sensors and local emitters of a scene, half of them each.
+    """Origins and directions (flat mi.Float) of so many rays that leave the sensors and local
+    emitters of a scene, half of them each.
 
     Where there are none, random lines through the scene.
     """
     mi = mitsuba()
     sampler = mi.load_dict({"type": "independent"})
-    kinds = [[s for s in kind if _sends_rays(s)] for kind in (scene.mi_scene.sensors(), scene.local_emitters)]
+    kinds = [
+        [s for s in kind if _sends_rays(s)]
+        for kind in (scene.mi_scene.sensors(), scene.local_emitters)
+    ]
     kinds = [kind for kind in kinds if kind]
     rays = []
     if not kinds:
         box = scene.mi_scene.bbox()
         sampler.seed(seed, count)
-        rays.append((_lines(sampler, box.center(), mi.Float(0.5 * np.linalg.norm(np.array(box.extents())))), count))
+        rays.append(
+            (
+                _lines(
+                    sampler, box.center(), mi.Float(0.5 * np.linalg.norm(np.array(box.extents())))
+                ),
+                count,
+            )
+        )
     for k, kind in enumerate(kinds):
         total = _share(count, k, len(kinds))
         for i, source in enumerate(kind):
             share = _share(total, i, len(kind))
             if share:
                 sampler.seed(seed + i, share)
-                rays.append((source.sample_ray(0.0, sampler.next_1d(), sampler.next_2d(), sampler.next_2d())[0], share))
-    random = np.random.default_rng(seed).permutation(count)  # else some lanes would start from one source only
-    return [mi.Float(np.concatenate([_rows(getattr(ray, name), n) for ray, n in rays])[random].ravel()) for name in ("o", "d")]
+                rays.append(
+                    (
+                        source.sample_ray(
+                            0.0, sampler.next_1d(), sampler.next_2d(), sampler.next_2d()
+                        )[0],
+                        share,
+                    )
+                )
+    # else some lanes would start from one source only
+    random = np.random.default_rng(seed).permutation(count)
+    return [
+        mi.Float(np.concatenate([_rows(getattr(ray, name), n) for ray, n in rays])[random].ravel())
+        for name in ("o", "d")
+    ]
 
 
 def _sends_rays(source):
-    """Whether Mitsuba can sample rays of a sensor or emitter; it cannot of those that measure at a surface."""
+    """Whether Mitsuba can sample rays of a sensor or emitter; it cannot of those that measure at a
+    surface.
+    """
     mi = mitsuba()
     try:
         source.sample_ray(0.0, mi.Float(0.5), mi.Point2f(0.5), mi.Point2f(0.5))

@@ -11,10 +11,20 @@ from .hull import ConvexHull
 from .lattice import Patches, node_count
 from .tessellate import TESSELLATED_SHAPES, patch_levels, tessellate
 
-POINT_FIELDS = ("positions", "normals", "geometric_normals", "albedo", "insets", "areas", "uv", "surface")
+POINT_FIELDS = (
+    "positions",
+    "normals",
+    "geometric_normals",
+    "albedo",
+    "insets",
+    "areas",
+    "uv",
+    "surface",
+)
 POINT_BUDGET = 40_000  # points that `auto` edge length aims at, beyond the meshes' own vertices
 MAX_POINTS = 4_000_000
-DIPPING_DEGREES = 1.0  # between a point's normal and its faces', above which its hemisphere counts as dipping below them
+# between a point's normal and its faces', above which its hemisphere counts as dipping below them
+DIPPING_DEGREES = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,10 +48,12 @@ class Points:
         Index into `surfaces`.
     patches : Patches
     surfaces : tuple of dict
-        name, kind, signature, flipped, first_patch and patches (their number) of each surface of the scene.
+        name, kind, signature, flipped, first_patch and patches (their number) of each surface of
+        the scene.
     report : dict
-        What was irregular: counts of degenerate faces, zero and flipped normals, back sides, and points whose smooth normal is
-        more than 1° off the mean of their faces, so that its hemisphere dips below them; edge length in metres.
+        What was irregular: counts of degenerate faces, zero and flipped normals, back sides, and
+        points whose smooth normal is more than 1° off the mean of their faces, so that its
+        hemisphere dips below them; edge length in metres.
     """
 
     positions: np.ndarray
@@ -65,7 +77,9 @@ class Points:
 
     @cached_property
     def hull(self):
-        """The ConvexHull of the points, computed once: 10 to 30 ms for 40,000, 0.3 s if they are all on the hull."""
+        """The ConvexHull of the points, computed once: 10 to 30 ms for 40,000, 0.3 s if they are
+        all on the hull.
+        """
         return ConvexHull(self.positions)
 
     def ray_origins(self, offset):
@@ -76,8 +90,8 @@ class Points:
 def sample_points(scene, edge_length="auto"):
     """Points on all surfaces of a scene.
 
-    Vertices of meshes are points; faces and analytic shapes with longer edges are tessellated down to the edge
-    length. Two-sided surfaces that do not enclose a volume get points on both sides.
+    Vertices of meshes are points; faces and analytic shapes with longer edges are tessellated down
+    to the edge length. Two-sided surfaces that do not enclose a volume get points on both sides.
 
     Parameters
     ----------
@@ -129,19 +143,33 @@ def sample_points(scene, edge_length="auto"):
         patch_total += len(part.levels)
     if not total:
         kinds = sorted({s.kind for s in scene.surfaces})
-        raise SceneError(f"none of the scene's shapes ({', '.join(kinds)}) can be sampled: use meshes or spheres, disks, …")
+        raise SceneError(
+            f"none of the scene's shapes ({', '.join(kinds)}) can be sampled: use meshes or"
+            " spheres, disks, …"
+        )
     levels = np.concatenate(levels).astype(np.int32)
     sizes = node_count(levels[:, 0].astype(np.int64), levels[:, 1].astype(np.int64))
     joined = {name: np.concatenate(values) for name, values in columns.items()}
     broken = np.flatnonzero(~np.isfinite(joined["albedo"]).all(axis=1))
     if len(broken):
         name = surfaces[joined["surface"][broken[0]]]["name"]
-        raise SceneError(f"the material of '{name}' has reflectances that are NaN or infinite: repair its texture first")
-    off = np.sum(joined["normals"] * joined["geometric_normals"], axis=1) < np.cos(np.radians(DIPPING_DEGREES))
+        raise SceneError(
+            f"the material of '{name}' has reflectances that are NaN or infinite: repair its"
+            " texture first"
+        )
+    off = np.sum(joined["normals"] * joined["geometric_normals"], axis=1) < np.cos(
+        np.radians(DIPPING_DEGREES)
+    )
     return Points(
-        **{name: values.astype(np.int32 if name == "surface" else np.float32) for name, values in joined.items()},
+        **{
+            name: values.astype(np.int32 if name == "surface" else np.float32)
+            for name, values in joined.items()
+        },
         patches=Patches(
-            levels, np.cumsum(sizes) - sizes, np.concatenate(nodes).astype(np.int32), np.concatenate(backs).astype(np.int32)
+            levels,
+            np.cumsum(sizes) - sizes,
+            np.concatenate(nodes).astype(np.int32),
+            np.concatenate(backs).astype(np.int32),
         ),
         surfaces=tuple(surfaces),
         report={"edge_length": length, **counts, "dipping_hemispheres": int(off.sum())},
@@ -166,12 +194,17 @@ def choose_edge_length(scene, edge_length="auto"):
         try:
             length = float(edge_length)
         except (TypeError, ValueError):
-            raise SettingsError(f"edge length '{edge_length}' is neither 'auto' nor a number of metres") from None
+            raise SettingsError(
+                f"edge length '{edge_length}' is neither 'auto' nor a number of metres"
+            ) from None
         if not (np.isfinite(length) and length > 0):
             raise SettingsError(f"edge length {edge_length} must be a positive number of metres")
         count = _count(surfaces, length)
         if count > MAX_POINTS:
-            raise SettingsError(f"edge length {length:g} m gives about {count:,} points, above {MAX_POINTS:,}: use a longer one")
+            raise SettingsError(
+                f"edge length {length:g} m gives about {count:,} points, above {MAX_POINTS:,}: use"
+                " a longer one"
+            )
         return length
     coarsest, finest = scene.scale / 4, scene.scale / 400
     budget = max(POINT_BUDGET, _count(surfaces, np.inf) + POINT_BUDGET // 4)
@@ -187,15 +220,20 @@ def choose_edge_length(scene, edge_length="auto"):
 
 
 def _count(surfaces, edge_length):
-    """About the number of points at an edge length: nodes, less those shared by neighbouring patches."""
+    """About the number of points at an edge length: nodes, less those shared by neighbouring
+    patches.
+    """
     total = 0
     for surface in surfaces:
         levels = patch_levels(surface, edge_length).astype(np.int64)
         sides = 2 if surface.material.two_sided and surface.kind != "Sphere" else 1
         if surface.kind == "mesh":
-            # v vertices, k − 1 nodes inside each edge (shared by two faces), the rest inside the faces.
+            # v vertices, k − 1 nodes inside each edge (shared by two faces), the rest inside the
+            # faces.
             k = levels[:, 0]
-            total += sides * int(surface.shape.vertex_count() + (1.5 * (k - 1) + (k - 1) * (k - 2) // 2).sum())
+            total += sides * int(
+                surface.shape.vertex_count() + (1.5 * (k - 1) + (k - 1) * (k - 2) // 2).sum()
+            )
         else:
             total += sides * int(node_count(levels[:, 0], levels[:, 1]).sum())
     return total

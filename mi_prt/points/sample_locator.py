@@ -16,7 +16,8 @@ ALIGNMENT = 8  # power of their cosine between normals: surfaces at right angles
 class SampleLocator:
     """Finds samples near places on surfaces, in the metric of `thinning`.
 
-    Each voxel of a regular grid lists all samples that can be within reach of a place in it, so that a look-up reads one list.
+    Each voxel of a regular grid lists all samples that can be within reach of a place in it, so
+    that a look-up reads one list.
 
     Parameters
     ----------
@@ -38,12 +39,17 @@ class SampleLocator:
             raise SceneError("there are no samples to look up")
         reach = REACH * radius
         low, high = positions.min(axis=0) - reach, positions.max(axis=0) + reach
-        edge = max(VOXEL * radius, float((np.prod((high - low).astype(np.float64)) / MOST_VOXELS) ** (1 / 3)))
+        edge = max(
+            VOXEL * radius,
+            float((np.prod((high - low).astype(np.float64)) / MOST_VOXELS) ** (1 / 3)),
+        )
         size = np.maximum(np.ceil((high - low) / edge).astype(np.int64), 1)
         starts, samples = _lists(positions, low, edge, size, reach)
         self._starts, self._samples = mi.UInt32(starts), mi.UInt32(samples)
         # 4 floats each: gathered in one load
-        self._positions, self._normals = (mi.Float(np.pad(x, ((0, 0), (0, 1))).ravel()) for x in (positions, normals))
+        self._positions, self._normals = (
+            mi.Float(np.pad(x, ((0, 0), (0, 1))).ravel()) for x in (positions, normals)
+        )
         self._low, self._size = mi.Point3f(*map(float, low)), mi.Vector3i(*map(int, size))
         dr.make_opaque(self._low, self._size)
         self._inverse_edge = dr.opaque(mi.Float, 1 / edge)
@@ -58,7 +64,8 @@ class SampleLocator:
         normal : mi.Normal3f
         active : mi.Bool
         seen_from : (mi.Point3f, mi.Vector3f), optional
-            A place and its normal: samples behind it do not count. Beside a thin wall they are nearest on its other side.
+            A place and its normal: samples behind it do not count. Beside a thin wall they are
+            nearest on its other side.
 
         Returns
         -------
@@ -78,7 +85,9 @@ class SampleLocator:
                 closer &= dr.dot(place - origin, up) > -BEHIND * self._radius
             return dr.select(closer, sample, nearest), dr.select(closer, distance, least)
 
-        index, squared = self._visit(position, normal, active, (mi.UInt32(0), mi.Float(dr.square(self._reach))), visit)
+        index, squared = self._visit(
+            position, normal, active, (mi.UInt32(0), mi.Float(dr.square(self._reach))), visit
+        )
         return index, dr.select(squared < dr.square(self._reach), dr.sqrt(squared), dr.inf)
 
     def interpolated(self, values, position, normal, active=True):
@@ -103,15 +112,23 @@ class SampleLocator:
 
         def visit(state, sample, place, distance, cosine):
             total, weights = state
-            weight = dr.maximum(1 - distance / dr.square(self._reach), 0) ** SHARPNESS * dr.maximum(cosine, 0) ** ALIGNMENT
-            return total + weight * dr.gather(mi.Color3f, values, sample, weight > 0), weights + weight
+            weight = (
+                dr.maximum(1 - distance / dr.square(self._reach), 0) ** SHARPNESS
+                * dr.maximum(cosine, 0) ** ALIGNMENT
+            )
+            return (
+                total + weight * dr.gather(mi.Color3f, values, sample, weight > 0),
+                weights + weight,
+            )
 
         total, weights = self._visit(position, normal, active, (mi.Color3f(0), mi.Float(0)), visit)
         found = weights > 1e-12
         return dr.select(found, total / weights, 0), found
 
     def _visit(self, position, normal, active, state, visit):
-        """Fold `visit(state, sample, its place, squared distance, cosine between normals)` over the samples of each place's voxel."""
+        """Fold `visit(state, sample, its place, squared distance, cosine between normals)` over the
+        samples of each place's voxel.
+        """
         import drjit as dr
 
         mi = mitsuba()
@@ -123,7 +140,10 @@ class SampleLocator:
 
         def step(entry, *state):
             sample = dr.gather(mi.UInt32, self._samples, entry)
-            p, n = dr.gather(mi.Vector4f, self._positions, sample), dr.gather(mi.Vector4f, self._normals, sample)
+            p, n = (
+                dr.gather(mi.Vector4f, self._positions, sample),
+                dr.gather(mi.Vector4f, self._normals, sample),
+            )
             place = mi.Point3f(p.x, p.y, p.z)
             turned = mi.Vector3f(normal.x - n.x, normal.y - n.y, normal.z - n.z)
             angle = dr.squared_norm(turned)
@@ -135,7 +155,9 @@ class SampleLocator:
 
 
 def _lists(positions, low, edge, size, reach):
-    """For each voxel where its list starts (v + 1,), and the lists one behind the other, both uint32."""
+    """For each voxel where its list starts (v + 1,), and the lists one behind the other, both
+    uint32.
+    """
     first = np.floor((positions - reach - low) / edge).astype(np.int64)
     spans = int(np.ceil(2 * reach / edge)) + 1
     voxels, samples = [], []
@@ -144,7 +166,11 @@ def _lists(positions, low, edge, size, reach):
         voxel = first + offset
         corner = low + voxel * edge
         gap = np.maximum(np.maximum(corner - positions, positions - corner - edge), 0)
-        touched = (np.einsum("ij,ij->i", gap, gap) < reach**2) & (voxel >= 0).all(axis=1) & (voxel < size).all(axis=1)
+        touched = (
+            (np.einsum("ij,ij->i", gap, gap) < reach**2)
+            & (voxel >= 0).all(axis=1)
+            & (voxel < size).all(axis=1)
+        )
         x, y, z = voxel[touched].T
         voxels.append((z * size[1] + y) * size[0] + x)
         samples.append(index[touched])

@@ -60,7 +60,8 @@ class Samples:
 
 
 def scatter_samples(scene, count, cluster_size, examples, seed=0):
-    """Samples in blue noise on all surfaces that light can reach, in clusters, and places for lights between them.
+    """Samples in blue noise on all surfaces that light can reach, in clusters, and places for
+    lights between them.
 
     Parameters
     ----------
@@ -76,8 +77,8 @@ def scatter_samples(scene, count, cluster_size, examples, seed=0):
     Returns
     -------
     samples : Samples
-        `points.report` holds radius, reachable_area (m², the sum of the points' areas) and coverage: the share of the reachable area
-        that is within a radius of a sample.
+        `points.report` holds radius, reachable_area (m², the sum of the points' areas) and
+        coverage: the share of the reachable area that is within a radius of a sample.
     places : (examples, 3) float32
 
     Raises
@@ -92,7 +93,10 @@ def scatter_samples(scene, count, cluster_size, examples, seed=0):
     hits = hits.at(np.random.default_rng(seed).permutation(len(hits))[: CANDIDATES * count])
     chosen, radius = thin(hits.positions, hits.normals, count, seed)
     if not radius > 0:
-        raise SettingsError(f"count {count:,} is too high: particles find fewer places on surfaces that are apart from each other")
+        raise SettingsError(
+            f"count {count:,} is too high: particles find fewer places on surfaces that are apart"
+            " from each other"
+        )
     hits = hits.at(chosen)
     roots, starts, order = _clusters(hits, max(1, round(count / cluster_size)), seed)
     hits = hits.at(order)
@@ -116,11 +120,13 @@ def scatter_samples(scene, count, cluster_size, examples, seed=0):
 
 
 def _clusters(hits, count, seed):
-    """Roots (c,) as positions in the new order, starts (c + 1,), and the order of points by cluster.
+    """Roots (c,) as positions in the new order, starts (c + 1,), and the order of points by
+    cluster.
 
-    Roots are thinned like samples, at a larger radius, and each sample belongs to the nearest. No sample is farther from its root than
-    about the radius, so that its normal is within 60° of the root's: no cluster holds both sides of a wall. (With fewer clusters than there
-    are such directions, six in a room, that cannot be.)
+    Roots are thinned like samples, at a larger radius, and each sample belongs to the nearest. No
+    sample is farther from its root than about the radius, so that its normal is within 60° of the
+    root's: no cluster holds both sides of a wall. (With fewer clusters than there are such
+    directions, six in a room, that cannot be.)
     """
     roots, radius = thin(hits.positions, hits.normals, count, seed)
     tree = cKDTree(embedded(hits.positions[roots], hits.normals[roots], radius))
@@ -133,7 +139,8 @@ def _clusters(hits, count, seed):
 def _areas(scene, hits, radius, seed):
     """Area (n,) of each sample in m², and the share of it that lies within a radius of a sample.
 
-    Random lines cross surfaces in places of equal density; each place counts for the nearest sample.
+    Random lines cross surfaces in places of equal density; each place counts for the nearest
+    sample.
     """
     import drjit as dr
 
@@ -144,7 +151,9 @@ def _areas(scene, hits, radius, seed):
     for crossings, area in cross_surfaces(scene, *ball, seed):
         blocks += 1
         if len(crossings):
-            index, distance = locator.nearest(*(_lanes(x) for x in (crossings.positions, crossings.normals)))
+            index, distance = locator.nearest(
+                *(_lanes(x) for x in (crossings.positions, crossings.normals))
+            )
             dr.eval(index, distance)
             distance = np.array(distance)
             covered = distance < COVERED * radius
@@ -159,13 +168,17 @@ def _areas(scene, hits, radius, seed):
 def _smoothed(hits, radius, areas):
     """Areas less the noise of their counts: the mean over neighbours; their sum stays."""
     points = embedded(hits.positions, hits.normals, radius)
-    neighbours = cKDTree(points).query(points, min(9, len(points)), workers=-1)[1].reshape(len(points), -1)
+    neighbours = (
+        cKDTree(points).query(points, min(9, len(points)), workers=-1)[1].reshape(len(points), -1)
+    )
     smooth = areas[neighbours].mean(axis=1)
     return smooth * (areas.sum() / max(smooth.sum(), 1e-300))
 
 
 def _lanes(vectors):
-    """Vectors (m, 3) in Dr.Jit, gathered: what is read lane by lane compiles another kernel where its memory is aligned otherwise."""
+    """Vectors (m, 3) in Dr.Jit, gathered: what is read lane by lane compiles another kernel where
+    its memory is aligned otherwise.
+    """
     import drjit as dr
 
     from ..system.runtime import mitsuba

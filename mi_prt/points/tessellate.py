@@ -10,7 +10,8 @@ from ..scene.traversal import transform_of
 from .lattice import Patches, lattice_nodes, lattice_triangles, node_count
 
 MAX_LEVEL = 4096
-# Least levels (k_u, k_v) that keep the polygonal outline of a curved shape smooth, for any edge length.
+# Least levels (k_u, k_v) that keep the polygonal outline of a curved shape smooth, for any edge
+# length.
 _LEAST_LEVELS = {"Sphere": (32, 16), "Cylinder": (32, 1), "Disk": (1, 32)}
 TESSELLATED_SHAPES = ("mesh", *_LEAST_LEVELS)
 
@@ -24,8 +25,8 @@ class SurfacePoints:
     positions, normals, geometric_normals : (n, 3) float64
         World space; the geometric normals look to the side of the shading normals.
     insets : (n, 3) float64
-        At the rim of the surface the unit vector along it and inward, elsewhere 0. A rim often lies exactly on another
-        surface (a floor ends at a wall): rays must start this side of it.
+        At the rim of the surface the unit vector along it and inward, elsewhere 0. A rim often lies
+        exactly on another surface (a floor ends at a wall): rays must start this side of it.
     uv : (n, 2) float32
     areas : (n,) float64
         m²; they sum to the area of the surface, or of the polyhedron that stands for it.
@@ -36,7 +37,8 @@ class SurfacePoints:
     levels : (p, 2), nodes : (t,)
         Patches as in `Patches`, with node indices local to this surface.
     sealed : bool
-        Whether the surface encloses a volume with the reflecting side outside, so that its back is never seen.
+        Whether the surface encloses a volume with the reflecting side outside, so that its back is
+        never seen.
     counts : dict
         Irregularities found: degenerate_faces, zero_normals, flipped_normals.
     """
@@ -56,7 +58,8 @@ class SurfacePoints:
 
 
 def patch_levels(surface, edge_length):
-    """Levels (p, 2) of a surface's patches so that no edge of the lattice exceeds `edge_length` metres.
+    """Levels (p, 2) of a surface's patches so that no edge of the lattice exceeds `edge_length`
+    metres.
 
     Raises
     ------
@@ -66,7 +69,9 @@ def patch_levels(surface, edge_length):
     if surface.kind == "mesh":
         corners = _world_corners(surface)
         if not np.isfinite(corners).all():
-            raise SceneError(f"mesh '{surface.name}' has positions that are NaN or infinite: repair it first")
+            raise SceneError(
+                f"mesh '{surface.name}' has positions that are NaN or infinite: repair it first"
+            )
         longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).max(axis=1)
         k = np.clip(np.ceil(longest / edge_length - 1e-6), 1, MAX_LEVEL).astype(np.int32)
         return np.stack([k, np.zeros_like(k)], axis=-1)
@@ -85,10 +90,14 @@ def tessellate(surface, edge_length):
         If a mesh has positions that are NaN or infinite.
     """
     levels = patch_levels(surface, edge_length)
-    return _tessellate_mesh(surface, levels) if surface.kind == "mesh" else _tessellate_analytic(surface, levels)
+    return (
+        _tessellate_mesh(surface, levels)
+        if surface.kind == "mesh"
+        else _tessellate_analytic(surface, levels)
+    )
 
 
-# --- meshes ------------------------------------------------------------------------------------------------------
+# --- meshes ---------------------------------------------------------------------------------------
 
 
 def _tessellate_mesh(surface, levels):
@@ -96,11 +105,15 @@ def _tessellate_mesh(surface, levels):
     world = _transformed(positions, surface.to_world)
     face_normals, face_areas = _face_geometry(world, faces)
     degenerate = face_areas <= 1e-12 * max(face_areas.max(initial=0.0), 1e-300)
-    # Mitsuba turns normals with flip_normals, and with an instance that mirrors: positions mirror, normals do not.
-    sign = float(np.sign(np.linalg.det(surface.to_world[:3, :3]))) * (-1.0 if surface.shape.has_flipped_normals() else 1.0)
+    # Mitsuba turns normals with flip_normals, and with an instance that mirrors: positions mirror,
+    # normals do not.
+    sign = float(np.sign(np.linalg.det(surface.to_world[:3, :3]))) * (
+        -1.0 if surface.shape.has_flipped_normals() else 1.0
+    )
     zero = 0
     if normals is None:
-        # A faceted mesh has one normal per face: split each vertex into one per distinct normal around it.
+        # A faceted mesh has one normal per face: split each vertex into one per distinct normal
+        # around it.
         faces, source = _split_by_normal(faces, face_normals)
         world, positions = world[source], positions[source]
         uv = None if uv is None else uv[source]
@@ -108,7 +121,8 @@ def _tessellate_mesh(surface, levels):
         normals[faces.ravel()] = np.repeat(sign * face_normals, 3, axis=0)
     else:
         normals, zero = _repaired_normals(normals, faces, sign * face_normals * face_areas[:, None])
-        normals = normals @ np.linalg.inv(surface.to_world[:3, :3])  # inverse transpose, for row vectors
+        # inverse transpose, for row vectors
+        normals = normals @ np.linalg.inv(surface.to_world[:3, :3])
     uv = np.zeros((len(world), 2), np.float32) if uv is None else uv
 
     face, barycentric, shares, identity = _mesh_nodes(faces, levels[:, 0], degenerate)
@@ -125,11 +139,16 @@ def _tessellate_mesh(surface, levels):
     node_areas = shares * face_areas[face]
     areas = np.bincount(identity[used], node_areas[used], count)
     geometric = np.stack(
-        [np.bincount(identity[used], (node_areas * face_normals[face, x])[used], count) for x in range(3)], axis=-1
+        [
+            np.bincount(identity[used], (node_areas * face_normals[face, x])[used], count)
+            for x in range(3)
+        ],
+        axis=-1,
     )
     geometric = sign * _unit(geometric)
     shading = _unit(at_points(normals))
-    shading = np.where(shading.any(axis=1)[:, None], shading, geometric)  # opposite normals cancel in between
+    # opposite normals cancel in between
+    shading = np.where(shading.any(axis=1)[:, None], shading, geometric)
     facing = np.sum(shading * geometric, axis=1)
     senses = np.unique(np.sign(facing))
     nodes = identity[_patch_order(levels[:, 0])]
@@ -145,7 +164,9 @@ def _tessellate_mesh(surface, levels):
         local_positions=at_points(positions),
         levels=levels,
         nodes=nodes,
-        sealed=_is_sealed(world, faces[~degenerate], senses[0] * sign) if len(senses) == 1 else False,
+        sealed=(
+            _is_sealed(world, faces[~degenerate], senses[0] * sign) if len(senses) == 1 else False
+        ),
         counts={
             "degenerate_faces": int(degenerate.sum()),
             "zero_normals": zero,
@@ -157,11 +178,13 @@ def _tessellate_mesh(surface, levels):
 def _mesh_nodes(faces, levels, degenerate):
     """Nodes of all faces, grouped by level.
 
-    Returns the face (t,) and barycentric coordinates (t, 3) of each node, its share (t,) of the face's area (a third of
-    each small triangle that it is a corner of), and the identity (t,) of the point there.
+    Returns the face (t,) and barycentric coordinates (t, 3) of each node, its share (t,) of the
+    face's area (a third of each small triangle that it is a corner of), and the identity (t,) of
+    the point there.
 
-    Corners are the mesh's vertices, nodes inside an edge are shared by the faces of the same level along it. Vertices
-    that only degenerate faces use get no point; nodes of degenerate faces point anywhere (they can't be hit).
+    Corners are the mesh's vertices, nodes inside an edge are shared by the faces of the same level
+    along it. Vertices that only degenerate faces use get no point; nodes of degenerate faces point
+    anywhere (they can't be hit).
     """
     vertices = int(faces.max(initial=-1)) + 1
     face_parts, barycentric_parts, share_parts, corner_parts, edge_parts = [], [], [], [], []
@@ -175,15 +198,24 @@ def _mesh_nodes(faces, levels, degenerate):
         face_parts.append(f)
         barycentric_parts.append(steps / k)
         triangles = lattice_triangles(k, 0)
-        share_parts.append(np.tile(np.bincount(triangles.ravel()) / 3 / len(triangles), len(of_level)))
+        share_parts.append(
+            np.tile(np.bincount(triangles.ravel()) / 3 / len(triangles), len(of_level))
+        )
         corner_parts.append(np.where(zeros == 2, faces[f, steps.argmax(axis=1)], -1))
-        # An edge node is known by its end vertices in ascending order, the level, and the steps from the first.
+        # An edge node is known by its end vertices in ascending order, the level, and the steps
+        # from the first.
         opposite = steps.argmin(axis=1)
         one, two = (opposite + 1) % 3, (opposite + 2) % 3
         rows = np.arange(len(f))
         v_one, v_two = faces[f, one], faces[f, two]
         from_low = np.where(v_one < v_two, steps[rows, two], steps[rows, one])
-        key = np.stack([np.minimum(v_one, v_two) * vertices + np.maximum(v_one, v_two), k * (MAX_LEVEL + 1) + from_low], -1)
+        key = np.stack(
+            [
+                np.minimum(v_one, v_two) * vertices + np.maximum(v_one, v_two),
+                k * (MAX_LEVEL + 1) + from_low,
+            ],
+            -1,
+        )
         edge_parts.append(np.where((zeros == 1)[:, None], key, -1))
     face, barycentric = np.concatenate(face_parts), np.concatenate(barycentric_parts)
     corner, edge = np.concatenate(corner_parts), np.concatenate(edge_parts)
@@ -200,12 +232,18 @@ def _mesh_nodes(faces, levels, degenerate):
 
 
 def _patch_order(levels):
-    """Where the nodes of `_mesh_nodes`, which are grouped by level, must go so that patches follow the faces' order."""
+    """Where the nodes of `_mesh_nodes`, which are grouped by level, must go so that patches follow
+    the faces' order.
+    """
     counts = node_count(levels, 0)
     grouped = np.argsort(levels, kind="stable")  # the faces in the order of their groups
     starts = np.empty(len(levels), np.int64)
     starts[grouped] = np.cumsum(counts[grouped]) - counts[grouped]
-    return np.repeat(starts, counts) + np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+    return (
+        np.repeat(starts, counts)
+        + np.arange(counts.sum())
+        - np.repeat(np.cumsum(counts) - counts, counts)
+    )
 
 
 def _split_by_normal(faces, face_normals):
@@ -228,37 +266,55 @@ def _face_geometry(positions, faces):
 
 
 def _repaired_normals(normals, faces, weighted_face_normals):
-    """Vertex normals (v, 3) with those that are zero or not finite replaced by the faces' around, and their number."""
+    """Vertex normals (v, 3) with those that are zero or not finite replaced by the faces' around,
+    and their number.
+    """
     broken = np.zeros(len(normals), bool)
     broken[faces.ravel()] = True
     broken &= ~(np.linalg.norm(normals, axis=1) > 1e-8)  # also true for NaN
     if not broken.any():
         return normals, 0
     around = np.stack(
-        [np.bincount(faces.ravel(), np.repeat(weighted_face_normals[:, x], 3), len(normals)) for x in range(3)], axis=-1
+        [
+            np.bincount(faces.ravel(), np.repeat(weighted_face_normals[:, x], 3), len(normals))
+            for x in range(3)
+        ],
+        axis=-1,
     )
     return np.where(broken[:, None], _unit(around), normals), int(broken.sum())
 
 
 def _insets(positions, normals, levels, nodes):
-    """Unit vectors (n, 3) from points on the rim toward the triangles they belong to, along the surface; 0 elsewhere."""
+    """Unit vectors (n, 3) from points on the rim toward the triangles they belong to, along the
+    surface; 0 elsewhere.
+    """
     counts = node_count(levels[:, 0].astype(np.int64), levels[:, 1].astype(np.int64))
-    triangles = Patches(levels, np.cumsum(counts) - counts, nodes, np.zeros(0, np.int32)).triangles()
-    edges = np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1)
-    keys, uses = np.unique(edges[:, 0].astype(np.int64) * len(positions) + edges[:, 1], return_counts=True)
+    triangles = Patches(
+        levels, np.cumsum(counts) - counts, nodes, np.zeros(0, np.int32)
+    ).triangles()
+    edges = np.sort(
+        np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1
+    )
+    keys, uses = np.unique(
+        edges[:, 0].astype(np.int64) * len(positions) + edges[:, 1], return_counts=True
+    )
     rim = np.zeros(len(positions), bool)
     rim[np.concatenate(np.divmod(keys[uses == 1], len(positions)))] = True
     inward = np.zeros_like(positions)
     centres = positions[triangles].mean(axis=1)
     for corner in triangles.T:
         for x in range(3):
-            inward[:, x] += np.bincount(corner, centres[:, x] - positions[corner, x], len(positions))
+            inward[:, x] += np.bincount(
+                corner, centres[:, x] - positions[corner, x], len(positions)
+            )
     inward -= np.sum(inward * normals, axis=1, keepdims=True) * normals
     return np.where(rim[:, None], _unit(inward), 0)
 
 
 def _is_sealed(positions, faces, sign):
-    """Whether every edge, welded by position, joins two faces of one sense, and the side of `sign` is outside."""
+    """Whether every edge, welded by position, joins two faces of one sense, and the side of `sign`
+    is outside.
+    """
     welded = np.unique(positions, axis=0, return_inverse=True)[1].ravel()[faces]
     count = len(positions) + 1
     edges = np.concatenate([welded[:, [0, 1]], welded[:, [1, 2]], welded[:, [2, 0]]])
@@ -270,7 +326,7 @@ def _is_sealed(positions, faces, sign):
     return bool(sign * np.sum(a * np.cross(b, c)) > 0)
 
 
-# --- analytic shapes ---------------------------------------------------------------------------------------------
+# --- analytic shapes ------------------------------------------------------------------------------
 
 
 def _tessellate_analytic(surface, levels):
@@ -290,7 +346,9 @@ def _tessellate_analytic(surface, levels):
     world = _transformed(local, surface.to_world)
     normals = _unit(normals @ np.linalg.inv(surface.to_world[:3, :3]))
     triangles = identity[lattice_triangles(*levels[0])]
-    areas = np.bincount(triangles.ravel(), np.repeat(_face_geometry(world, triangles)[1] / 3, 3), len(first))
+    areas = np.bincount(
+        triangles.ravel(), np.repeat(_face_geometry(world, triangles)[1] / 3, 3), len(first)
+    )
     return SurfacePoints(
         positions=world,
         normals=normals,
@@ -308,10 +366,11 @@ def _tessellate_analytic(surface, levels):
 
 
 def _evaluate(surface, uv):
-    """Positions and unit normals (k, 3) at the shape's own (u, v), in the frame of the shape or its group.
+    """Positions and unit normals (k, 3) at the shape's own (u, v), in the frame of the shape or its
+    group.
 
-    Mitsuba's parametrisations of the unit shapes, in closed form: its `eval_parameterization` misses the rims of
-    cylinders and forgets `flip_normals` of spheres.
+    Mitsuba's parametrisations of the unit shapes, in closed form: its `eval_parameterization`
+    misses the rims of cylinders and forgets `flip_normals` of spheres.
     """
     u, v = uv.T.astype(np.float64)
     to_world = transform_of(surface.shape)
@@ -327,7 +386,9 @@ def _evaluate(surface, uv):
         local = _on_circle(v, u, np.zeros_like(u))
         normals = np.broadcast_to([0.0, 0.0, 1.0], local.shape)
     normals = _unit(normals @ np.linalg.inv(to_world[:3, :3]))
-    return _transformed(local, to_world), -normals if surface.shape.has_flipped_normals() else normals
+    return _transformed(local, to_world), (
+        -normals if surface.shape.has_flipped_normals() else normals
+    )
 
 
 def _on_circle(turn, radius, height):
@@ -338,7 +399,9 @@ def _on_circle(turn, radius, height):
 def _analytic_lengths(surface):
     """Longest extents (u, v) of the shape along its parameters, in metres."""
     side = 33
-    grid = np.stack(np.meshgrid(np.linspace(0, 1, side), np.linspace(0, 1, side)), axis=-1).reshape(-1, 2)
+    grid = np.stack(np.meshgrid(np.linspace(0, 1, side), np.linspace(0, 1, side)), axis=-1).reshape(
+        -1, 2
+    )
     local, _ = _evaluate(surface, grid)
     world = _transformed(local, surface.to_world).reshape(side, side, 3)
     along_u = np.linalg.norm(np.diff(world, axis=1), axis=-1).sum(axis=1).max()

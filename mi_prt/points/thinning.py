@@ -1,8 +1,10 @@
-"""Blue noise by thinning: of many candidates those stay that keep a distance from each other (Meshless PRT, section 4.1).
+"""Blue noise by thinning: of many candidates those stay that keep a distance from each other
+(Meshless PRT, section 4.1).
 
-Distance is measured in position and normal together, d² = |Δp|² + (r·Δn)² for a radius r. On a curved surface of curvature κ normals
-turn by κ|Δp|, so that points come closer by √(1 + κ²r²): the radius shrinks with curvature, as the paper asks. And points whose normals
-are more than 60° apart never are nearer than r: the two sides of a thin wall do not thin each other.
+Distance is measured in position and normal together, d² = |Δp|² + (r·Δn)² for a radius r. On a
+curved surface of curvature κ normals turn by κ|Δp|, so that points come closer by √(1 + κ²r²): the
+radius shrinks with curvature, as the paper asks. And points whose normals are more than 60° apart
+never are nearer than r: the two sides of a thin wall do not thin each other.
 """
 
 import numpy as np
@@ -18,7 +20,9 @@ _BATCH = 512  # candidates that are tried first
 
 
 def embedded(positions, normals, radius):
-    """Points (n, 6) whose Euclidean distances are those of the module's metric; of free positions (normals None) just these."""
+    """Points (n, 6) whose Euclidean distances are those of the module's metric; of free positions
+    (normals None) just these.
+    """
     return positions if normals is None else np.hstack([positions, np.float32(radius) * normals])
 
 
@@ -56,7 +60,11 @@ def thin(positions, normals, count, seed=0, dimension=2):
     nothing = chosen = np.empty(0, np.int64)
     # Too small at first would leave holes: points end before every candidate is near one.
     extent = float(np.linalg.norm(np.ptp(positions, axis=0)))
-    while m > count and 0 < radius < extent and len(_add(embedded(positions, normals, radius), order, nothing, radius, count)) == count:
+    while (
+        m > count
+        and 0 < radius < extent
+        and len(_add(embedded(positions, normals, radius), order, nothing, radius, count)) == count
+    ):
         radius *= _GROW
     while True:
         chosen = _add(embedded(positions, normals, radius), order, chosen, radius, count)
@@ -66,12 +74,21 @@ def thin(positions, normals, count, seed=0, dimension=2):
 
 
 def _expected_radius(positions, normals, count, pilot, dimension):
-    """A radius a little above the one at which `count` points stay, told by thinning a few of the candidates to fewer."""
+    """A radius a little above the one at which `count` points stay, told by thinning a few of the
+    candidates to fewer.
+    """
     positions, normals = positions[pilot], None if normals is None else normals[pilot]
     radius = float(np.linalg.norm(np.ptp(positions, axis=0))) / 4
     wanted = min(max(len(pilot) // 8, 2), count)
     while radius > 1e-30:
-        found = len(_add(embedded(positions, normals, radius), np.arange(len(pilot)), np.empty(0, np.int64), radius))
+        found = len(
+            _add(
+                embedded(positions, normals, radius),
+                np.arange(len(pilot)),
+                np.empty(0, np.int64),
+                radius,
+            )
+        )
         if found >= wanted:
             return _MARGIN * radius * (found / count) ** (1 / dimension)
         radius *= 0.8
@@ -79,9 +96,11 @@ def _expected_radius(positions, normals, count, pilot, dimension):
 
 
 def _add(points, order, chosen, radius, most=None):
-    """Choose more points in their order, until none is left that keeps its distance or there are `most`.
+    """Choose more points in their order, until none is left that keeps its distance or there are
+    `most`.
 
-    Points come in batches that double: crowds of them are struck out by the first few, before any pair of them is looked at.
+    Points come in batches that double: crowds of them are struck out by the first few, before any
+    pair of them is looked at.
     """
     taken = np.zeros(len(points), bool)
     taken[chosen] = True
@@ -91,7 +110,9 @@ def _add(points, order, chosen, radius, most=None):
         batch = waiting[first : first + size]
         first, size = first + size, 2 * size
         if len(chosen):
-            distance, _ = cKDTree(points[chosen]).query(points[batch], distance_upper_bound=max(radius, 1e-300), workers=-1)
+            distance, _ = cKDTree(points[chosen]).query(
+                points[batch], distance_upper_bound=max(radius, 1e-300), workers=-1
+            )
             batch = batch[distance >= radius]
         new = batch[_keep_distance(points[batch], radius)]
         chosen = np.concatenate([chosen, new])
@@ -101,12 +122,18 @@ def _add(points, order, chosen, radius, most=None):
 
 
 def _keep_distance(points, radius):
-    """Which points (n,) bool stay when each strikes out the later ones that are nearer to it than a radius.
+    """Which points (n,) bool stay when each strikes out the later ones that are nearer to it than a
+    radius.
 
-    All that come before each of their undecided neighbours are chosen at once: the result is that of one after the other.
+    All that come before each of their undecided neighbours are chosen at once: the result is that
+    of one after the other.
     """
     kept = np.zeros(len(points), bool)
-    first, second = cKDTree(points).query_pairs(np.nextafter(radius, 0), output_type="ndarray").T if radius else np.empty((2, 0), int)
+    first, second = (
+        cKDTree(points).query_pairs(np.nextafter(radius, 0), output_type="ndarray").T
+        if radius
+        else np.empty((2, 0), int)
+    )
     undecided = ~kept
     while undecided.any():
         now = undecided.copy()

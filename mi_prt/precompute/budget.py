@@ -5,20 +5,25 @@ import numpy as np
 from ..basis.bases import coefficient_bytes, fit_bytes
 from ..basis.total import PROBES
 from ..errors import SettingsError
-from .reflections import GREY, MOST_RAYS
 from ..system.memory import resident_bytes
 from ..system.parallel import BLOCK_ROWS
 from ..system.runtime import thread_count
 from ..transport.direct import LANES
 from ..transport.interreflection import COLUMNS
+from .reflections import GREY, MOST_RAYS
 
 LANE_BYTES = 40  # of a wavefront, for each of its rays
 LEAST_LANES = 1 << 16
-POINT_BYTES = 240  # for each point, what the ray tracer and the fit hold of it beside the points themselves
-INDIRECT_LANE_BYTES = 400  # the same of rays that are followed to surfaces, with what they bring back
-CHOICE_BYTES, CHOSEN_BYTES = 30, 60  # while blocked directions are drawn, for each of those that there are and of those drawn
+# for each point, what the ray tracer and the fit hold of it beside the points themselves
+POINT_BYTES = 240
+# the same of rays that are followed to surfaces, with what they bring back
+INDIRECT_LANE_BYTES = 400
+# while blocked directions are drawn, for each of those that there are and of those drawn
+CHOICE_BYTES, CHOSEN_BYTES = 30, 60
 SUMMED_TERMS, SOLVED_TERMS = 3, 9  # vectors that a series, and a Krylov method, work on at a time
-COPIES = {"haar": 3.2}  # of the stored coefficients in memory, where blocks are put together: indices are wider there; else 2
+# of the stored coefficients in memory, where blocks are put together: indices are wider there; else
+# 2
+COPIES = {"haar": 3.2}
 
 
 def held_coefficient_bytes(settings, points, directions, components, channels):
@@ -31,13 +36,21 @@ def held_coefficient_bytes(settings, points, directions, components, channels):
     channels : 1 or 3
         Of total transport; see `expected_channels`.
     """
-    size = coefficient_bytes(settings.basis, points, directions, components, settings.rays_per_direction)
+    size = coefficient_bytes(
+        settings.basis, points, directions, components, settings.rays_per_direction
+    )
     held = COPIES.get(settings.basis, 2) * size
     if settings.bounces != 0:
         size = size * (components + PROBES) // max(components, 1)
-        # Direct transport; two estimates of indirect transport, and their difference or the rows they come from; what is summed of
-        # some columns.
-        columns = 4 * points * channels * (SUMMED_TERMS if settings.bounces != "auto" else SOLVED_TERMS) * min(COLUMNS, components + 1)
+        # Direct transport; two estimates of indirect transport, and their difference or the rows
+        # they come from; what is summed of some columns.
+        columns = (
+            4
+            * points
+            * channels
+            * (SUMMED_TERMS if settings.bounces != "auto" else SOLVED_TERMS)
+            * min(COLUMNS, components + 1)
+        )
         held = size + (3 if settings.indirect == "solve" else 4) * size * channels + columns
     return int(held)
 
@@ -55,7 +68,8 @@ class Room:
     limit : int
         Bytes that the process may have resident.
     scene : Scene
-        Its shapes for the ray tracer are built here, so that they count: they are a copy of all triangles.
+        Its shapes for the ray tracer are built here, so that they count: they are a copy of all
+        triangles.
     points : Points
     directions : DirectionLattice
     settings : Settings
@@ -87,12 +101,17 @@ class Room:
             drawn = MOST_RAYS if settings.paths_per_point == "auto" else settings.paths_per_point
             blocks = max(blocks, CHOICE_BYTES * s // 2 * rays + CHOSEN_BYTES * drawn)
         blocks *= BLOCK_ROWS * thread_count()
-        fixed = POINT_BYTES * n + blocks + held_coefficient_bytes(settings, n, s, components, self.channels)
+        fixed = (
+            POINT_BYTES * n
+            + blocks
+            + held_coefficient_bytes(settings, n, s, components, self.channels)
+        )
         needed = fixed + fit_bytes(settings.basis, n, s, components) + LANE_BYTES * LEAST_LANES
         if limit - held < needed:
             raise SettingsError(
-                f"memory {limit / 1e6:,.0f} MB is too little: the scene holds {held / 1e6:,.0f} MB and the run needs "
-                f"{needed / 1e6:,.0f} MB more; raise max_memory (--max-memory) or use fewer points, directions or coefficients"
+                f"memory {limit / 1e6:,.0f} MB is too little: the scene holds {held / 1e6:,.0f} MB"
+                f" and the run needs {needed / 1e6:,.0f} MB more; raise max_memory (--max-memory)"
+                " or use fewer points, directions or coefficients"
             )
         self.lanes = int(min(LANES, (limit - held - fixed) // LANE_BYTES))
         self.basis = limit - held - fixed

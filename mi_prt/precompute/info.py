@@ -6,31 +6,33 @@ from dataclasses import asdict
 import numpy as np
 
 from ..asset.asset_file import coefficient_arrays
+from ..asset.meshless_asset import MeshlessAsset
+from ..asset.provenance import left_out
 from ..basis.bases import coefficient_bytes, fit_bytes
 from ..directions import parse_directions
-from .reflections import surface_shares
-from .reflections import GREY
-from ..system.memory import resident_bytes
-from ..asset.meshless_asset import MeshlessAsset
-from .meshless_info import describe_meshless, describe_meshless_asset
-from ..system.parallel import BLOCK_ROWS, map_chunks
 from ..points.points import POINT_BUDGET, sample_points
-from ..asset.provenance import left_out
-from .budget import LANE_BYTES, POINT_BYTES, expected_channels, held_coefficient_bytes
 from ..scene.scene import open_scene
-from .settings import DIRECT_ONLY, MeshlessSettings, Settings
+from ..system.memory import resident_bytes
+from ..system.parallel import BLOCK_ROWS, map_chunks
 from ..transport.direct import LANES, find_buried, sample_direct
 from ..transport.hops import blocked_share
 from ..transport.interreflection import BOUNCE_TOLERANCE
 from ..transport.paths import PathSampler, energies
+from .budget import LANE_BYTES, POINT_BYTES, expected_channels, held_coefficient_bytes
+from .meshless_info import describe_meshless, describe_meshless_asset
+from .reflections import GREY, surface_shares
+from .settings import DIRECT_ONLY, MeshlessSettings, Settings
 
 PROBE_POINTS = 256
 PROBE_BLOCKS = 32
 PROBE_PATHS = 256
 EXPECTED_PATHS = 256  # what `auto` is predicted with
-SPARSE_WORK = 50  # time of a multiplication in the sparse products of reflections, in those of a dense product
-AUTO_COEFFICIENTS = 64  # what `auto` is predicted with: how many it takes is known once it is fitted
-# Work of fitting and encoding: how often all rows are expanded (and transformed), and multiplied with as many vectors as components.
+# time of a multiplication in the sparse products of reflections, in those of a dense product
+SPARSE_WORK = 50
+# what `auto` is predicted with: how many it takes is known once it is fitted
+AUTO_COEFFICIENTS = 64
+# Work of fitting and encoding: how often all rows are expanded (and transformed), and multiplied
+# with as many vectors as components.
 BASIS_WORK = {"pca": (3, 20), "sh": (1, 2), "haar": (3, 0), "haar-shared": (2, 1), "none": (0, 0)}
 
 
@@ -50,7 +52,8 @@ def describe(source, parameters=None, points="vertices", **settings):
     Returns
     -------
     dict
-        requires{…}, settings{… each with value and reason}, left_out[…], predicted{seconds, peak_memory_bytes, bytes}.
+        requires{…}, settings{… each with value and reason}, left_out[…], predicted{seconds,
+        peak_memory_bytes, bytes}.
     """
     if points == "samples":
         return describe_meshless(open_scene(source, parameters), MeshlessSettings(**settings))
@@ -72,13 +75,20 @@ def describe(source, parameters=None, points="vertices", **settings):
     basis = n * (expanded * probe["expanding"] + multiplied * probe["multiplying"])
     reflections = _probe_reflections(scene, points, directions, settings)
     channels = expected_channels(points, settings) if reflections["bounces"] else 1
-    indirect = _indirect_seconds(reflections, n, coefficients, channels, probe["multiplying"] / s / max(coefficients, 1))
+    indirect = _indirect_seconds(
+        reflections, n, coefficients, channels, probe["multiplying"] / s / max(coefficients, 1)
+    )
     relighting, projection = storage_bytes(settings.basis, n, s, coefficients, rays, channels)
     stored = relighting + projection + n * 77 + s * 24 + 4 * len(points.patches.nodes)
-    working = LANES * LANE_BYTES // 2 + POINT_BYTES * n + fit_bytes(settings.basis, n, s, coefficients)
+    working = (
+        LANES * LANE_BYTES // 2 + POINT_BYTES * n + fit_bytes(settings.basis, n, s, coefficients)
+    )
     working += held_coefficient_bytes(settings, n, s, coefficients, channels)
     return {
-        "requires": _requirements(scene, points, int(probe["rays"] * n)) | {"bounce_energy": reflections["energy"]},
+        "requires": (
+            _requirements(scene, points, int(probe["rays"] * n))
+            | {"bounce_energy": reflections["energy"]}
+        ),
         "settings": _reasons(settings, points, directions, coefficients, reflections),
         "left_out": left_out(scene),
         "predicted": {
@@ -101,40 +111,55 @@ def storage_bytes(basis, points, directions, coefficients, rays_per_direction=1,
         v, s and d of the paper.
     rays_per_direction : int
     channels : 1 or 3
-        Of the transport. Principal components hold all of them; in other bases each has coefficients of its own.
+        Of the transport. Principal components hold all of them; in other bases each has
+        coefficients of its own.
 
     Returns
     -------
     relighting : int
-        Bytes of the coefficients of all points and of the light: 4d(v + 1), single precision. `haar` adds the indices of its
-        coefficients, `none` takes a bit for each ray.
+        Bytes of the coefficients of all points and of the light: 4d(v + 1), single precision.
+        `haar` adds the indices of its coefficients, `none` takes a bit for each ray.
     projection : int
         Bytes of the matrix that projects light: 4ds. `haar` needs none, its transform is computed.
     """
     light = {"haar": directions, "none": directions}.get(basis, coefficients)
     sets, functions = (1, channels) if basis == "pca" else (channels, 1)
-    relighting = sets * coefficient_bytes(basis, points, directions, coefficients, rays_per_direction) + 4 * light
-    projection = {"haar": 0, "none": 4 * directions}.get(basis, 4 * functions * coefficients * directions)
+    relighting = (
+        sets * coefficient_bytes(basis, points, directions, coefficients, rays_per_direction)
+        + 4 * light
+    )
+    projection = {"haar": 0, "none": 4 * directions}.get(
+        basis, 4 * functions * coefficients * directions
+    )
     return relighting, projection
 
 
 def describe_asset(asset):
     """What an asset holds, as plain data.
 
-    `storage` has bytes as predicted by the formula of the paper's section 7.1 (see `storage_bytes`) and as measured: of the arrays
-    in the file and of the file.
+    `storage` has bytes as predicted by the formula of the paper's section 7.1 (see `storage_bytes`)
+    and as measured: of the arrays in the file and of the file.
     """
     if isinstance(asset, MeshlessAsset):
         return describe_meshless_asset(asset)
     n, s, d = len(asset.points), len(asset.directions), len(asset.basis)
-    relighting, projection = storage_bytes(asset.basis.kind, n, s, d, asset.settings["rays_per_direction"], asset.channels)
+    relighting, projection = storage_bytes(
+        asset.basis.kind, n, s, d, asset.settings["rays_per_direction"], asset.channels
+    )
     measured = {
-        "coefficients": sum(array.nbytes for array in coefficient_arrays(asset.coefficients).values()),
+        "coefficients": sum(
+            array.nbytes for array in coefficient_arrays(asset.coefficients).values()
+        ),
         "basis": sum(getattr(asset.basis, name).nbytes for name in asset.basis.ARRAYS),
         "file": asset.path.stat().st_size if asset.path else None,
     }
-    # Without a mean the components also hold that of the transport, and their energies sum to more than the variance.
-    per_component = "captured_variance_per_component" if asset.basis.kind == "pca" else "energy_over_variance_per_component"
+    # Without a mean the components also hold that of the transport, and their energies sum to more
+    # than the variance.
+    per_component = (
+        "captured_variance_per_component"
+        if asset.basis.kind == "pca"
+        else "energy_over_variance_per_component"
+    )
     return {
         "points": n,
         "directions": s,
@@ -144,7 +169,10 @@ def describe_asset(asset):
         "captured_variance": asset.report["captured_variance"],
         "relative_error": asset.report["relative_error"],
         per_component: [round(float(v), 6) for v in asset.basis.captured_variance],
-        "storage": {"predicted": {"relighting": relighting, "projection": projection}, "measured": measured},
+        "storage": {
+            "predicted": {"relighting": relighting, "projection": projection},
+            "measured": measured,
+        },
         "buried_points": int(asset.buried.sum()),
         "scene": asset.scene,
         "settings": asset.settings,
@@ -164,7 +192,10 @@ def _probe(scene, points, directions, settings, coefficients):
     vectors = np.ones((len(directions), coefficients), np.float32)
     rows = transport.rows(slice(0, BLOCK_ROWS))
     seconds = {}
-    for name, run in {"expanding": lambda: transport.rows(slice(0, BLOCK_ROWS)), "multiplying": lambda: rows @ vectors}.items():
+    for name, run in {
+        "expanding": lambda: transport.rows(slice(0, BLOCK_ROWS)),
+        "multiplying": lambda: rows @ vectors,
+    }.items():
         list(map_chunks(lambda _: run(), range(8)))  # until memory is warm
         started = time.perf_counter()
         list(map_chunks(lambda _: run(), range(PROBE_BLOCKS)))
@@ -173,13 +204,14 @@ def _probe(scene, points, directions, settings, coefficients):
 
 
 def _probe_reflections(scene, points, directions, settings):
-    """How light splits by reflections, told by paths from a sample of the points, and how fast they are traced.
+    """How light splits by reflections, told by paths from a sample of the points, and how fast they
+    are traced.
 
     Returns
     -------
     dict
-        energy (see `BounceSplit`; direct light within about 3 %, reflections 20 %), bounces (expected), rate (paths
-        per second), paths (from each point).
+        energy (see `BounceSplit`; direct light within about 3 %, reflections 20 %), bounces
+        (expected), rate (paths per second), paths (from each point).
     """
     index = np.random.default_rng(settings.seed).permutation(len(points))[:PROBE_POINTS]
     few = points.at(index)
@@ -196,14 +228,31 @@ def _probe_reflections(scene, points, directions, settings):
     split = weights @ energies(sampler.escapes(np.arange(len(few))), PROBE_PATHS)
     rate = len(few) * PROBE_PATHS / (time.perf_counter() - started)
     left = np.append(split, 0)[::-1].cumsum()[::-1]
-    bounces = int(np.argmax(left <= (BOUNCE_TOLERANCE * (direct + left[0]) if wanted is None else 0)))
-    return {"energy": [round(x, 6) for x in (direct, *split[:bounces].tolist())], "bounces": bounces, "rate": rate, "paths": paths}
+    bounces = int(
+        np.argmax(left <= (BOUNCE_TOLERANCE * (direct + left[0]) if wanted is None else 0))
+    )
+    return {
+        "energy": [round(x, 6) for x in (direct, *split[:bounces].tolist())],
+        "bounces": bounces,
+        "rate": rate,
+        "paths": paths,
+    }
 
 
 def _indirect_seconds(reflections, points, coefficients, channels, product):
-    """Seconds that reflections are expected to take; `product` is the time of one multiplication in a dense product."""
+    """Seconds that reflections are expected to take; `product` is the time of one multiplication in
+    a dense product.
+    """
     traced = points * reflections["paths"] / reflections["rate"]
-    return traced * (1 + SPARSE_WORK * product * reflections["rate"] * coefficients * channels * reflections["bounces"])
+    return traced * (
+        1
+        + SPARSE_WORK
+        * product
+        * reflections["rate"]
+        * coefficients
+        * channels
+        * reflections["bounces"]
+    )
 
 
 def _requirements(scene, points, rays):
@@ -232,27 +281,46 @@ def _reasons(settings, points, directions, coefficients, reflections):
     """The settings that would be used, each with its reason."""
     chosen = asdict(settings)
     edge = points.report["edge_length"]
-    auto = f"finest of 1/400…1/4 of the scene's scale that keeps it near {POINT_BUDGET:,} points beyond its vertices"
+    auto = (
+        f"finest of 1/400…1/4 of the scene's scale that keeps it near {POINT_BUDGET:,} points"
+        " beyond its vertices"
+    )
     reasons = {
-        "directions": f"{len(directions):,} cells, about {np.degrees(np.sqrt(4 * np.pi / len(directions))):.1f}° wide: "
-        "sharper shadows need more",
-        "basis": "components of this scene's own transport: the least error for their number"
-        if settings.basis == "pca"
-        else "as asked",
+        "directions": (
+            f"{len(directions):,} cells, about"
+            f" {np.degrees(np.sqrt(4 * np.pi / len(directions))):.1f}° wide: sharper shadows need"
+            " more"
+        ),
+        "basis": (
+            "components of this scene's own transport: the least error for their number"
+            if settings.basis == "pca"
+            else "as asked"
+        ),
         "coefficients": _coefficients_reason(settings),
         "edge_length": auto if settings.edge_length == "auto" else "as asked",
         "rays_per_direction": "1 samples the middle of each cell; 4 antialias the edges of shadows",
         "bounces": _bounces_reason(settings, reflections),
-        "indirect": "light goes from point to point, in coefficients: least noise"
-        if settings.indirect == "solve"
-        else "unbiased paths from each point: more noise",
-        "paths_per_point": f"so many that noise is about 1 % of the transport; the prediction takes {EXPECTED_PATHS}"
-        if settings.paths_per_point == "auto"
-        else "as asked",
-        "denoise": "components of reflected light keep the share of their variance that is signal"
-        if settings.denoise
-        else "as asked",
-        "seed": "start of the randomized fit" if settings.basis == "pca" else "nothing is random with this basis",
+        "indirect": (
+            "light goes from point to point, in coefficients: least noise"
+            if settings.indirect == "solve"
+            else "unbiased paths from each point: more noise"
+        ),
+        "paths_per_point": (
+            "so many that noise is about 1 % of the transport; the prediction takes"
+            f" {EXPECTED_PATHS}"
+            if settings.paths_per_point == "auto"
+            else "as asked"
+        ),
+        "denoise": (
+            "components of reflected light keep the share of their variance that is signal"
+            if settings.denoise
+            else "as asked"
+        ),
+        "seed": (
+            "start of the randomized fit"
+            if settings.basis == "pca"
+            else "nothing is random with this basis"
+        ),
     }
     chosen |= {"coefficients": coefficients, "edge_length": round(edge, 6)}
     if settings.variance is not None:
@@ -275,7 +343,10 @@ def _coefficients_reason(settings):
     if settings.basis == "none":
         return "no basis: all directions are kept, as bits of visibility"
     if settings.variance is not None:
-        return f"as few as capture {settings.variance:g} of the variance; the prediction takes {AUTO_COEFFICIENTS}"
+        return (
+            f"as few as capture {settings.variance:g} of the variance; the prediction takes"
+            f" {AUTO_COEFFICIENTS}"
+        )
     if settings.coefficients is None:
         return "so many relight in about a millisecond; more of them sharpen shadows"
     return "as asked"

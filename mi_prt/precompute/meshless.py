@@ -1,4 +1,6 @@
-"""From a scene to an asset of local lights: samples, example light, depth buffers, transfer (Meshless PRT, section 4)."""
+"""From a scene to an asset of local lights: samples, example light, depth buffers, transfer
+(Meshless PRT, section 4).
+"""
 
 import hashlib
 import time
@@ -8,19 +10,18 @@ from dataclasses import asdict
 import numpy as np
 import scipy.sparse
 
+from ..asset.meshless_asset import MeshlessAsset
+from ..asset.meshless_file import as_stored
 from ..basis.clustered import leading_components
 from ..directions.hemisphere import Hemisphere
 from ..errors import LightError, SettingsError
-from .reflections import GREY
 from ..lighting.emission import emission_of
 from ..lighting.light import Light, as_light
 from ..lighting.local_emitters import local_scene_light
 from ..lighting.local_lights import PointLight
-from ..system.memory import resident_bytes
-from ..asset.meshless_asset import MeshlessAsset
-from ..asset.meshless_file import as_stored
-from ..system.parallel import map_chunks
 from ..points.samples import scatter_samples
+from ..system.memory import resident_bytes
+from ..system.parallel import map_chunks
 from ..system.runtime import versions
 from ..transport.depth import DepthBuffers, compress
 from ..transport.direct import LANES
@@ -29,6 +30,7 @@ from ..transport.hemispheres import NOTHING, HemisphereTracer, cluster_frames, g
 from ..transport.local_direct import LocalDirect
 from ..transport.transfer import all_reflections, fit_senders
 from ..transport.transfer_matrix import Transfer, within_budget
+from .reflections import GREY
 
 FUNCTIONALS = 256  # random sums over receivers that tell how much light at a sample matters
 IMPORTANCE_DIRECTIONS = 256  # rays of each receiver for that
@@ -62,7 +64,9 @@ class MeshlessPrecomputation:
         self.channels = 3 if np.ptp(self.points.albedo, axis=1).max(initial=0) > GREY else 1
         self.own_light, self.no_own_light = _own_light(scene)
         self.hemisphere = Hemisphere(settings.depth_directions)
-        self.extent = max(float(np.linalg.norm(np.ptp(self.points.positions, axis=0))), 1e-6 * scene.scale)
+        self.extent = max(
+            float(np.linalg.norm(np.ptp(self.points.positions, axis=0))), 1e-6 * scene.scale
+        )
         self.lanes = self._lanes(limit)
 
     def _lanes(self, limit):
@@ -80,13 +84,16 @@ class MeshlessPrecomputation:
         held = resident_bytes()
         if limit - held < needed + LANE_BYTES * LEAST_LANES:
             raise SettingsError(
-                f"memory {limit / 1e6:,.0f} MB is too little: the scene holds {held / 1e6:,.0f} MB and the run needs "
-                f"{needed / 1e6:,.0f} MB more; raise max_memory (--max-memory) or use fewer samples, example lights or coefficients"
+                f"memory {limit / 1e6:,.0f} MB is too little: the scene holds {held / 1e6:,.0f} MB"
+                f" and the run needs {needed / 1e6:,.0f} MB more; raise max_memory (--max-memory)"
+                " or use fewer samples, example lights or coefficients"
             )
         return int(min(LANES, (limit - held - needed) // LANE_BYTES))
 
     def identity(self):
-        """All that the result depends on: what must not change between a run and its continuation."""
+        """All that the result depends on: what must not change between a run and its
+        continuation.
+        """
         digest = hashlib.sha256()
         for values in (self.points.positions, self.points.normals, self.points.areas, self.places):
             digest.update(np.ascontiguousarray(values).tobytes())
@@ -125,10 +132,16 @@ class MeshlessPrecomputation:
             scene=description,
             settings={"points": "samples"} | asdict(settings),
             versions=versions(),
-            report={"bounces": 0, "rays": self.rays, "no_own_light": self.no_own_light, "channels": self.channels if transfer is not None else 1, **report},
+            report={
+                "bounces": 0,
+                "rays": self.rays,
+                "no_own_light": self.no_own_light,
+                "channels": self.channels if transfer is not None else 1,
+                **report,
+            },
         )
 
-    # --- direct light of examples ----------------------------------------------------------------------------------
+    # --- direct light of examples -----------------------------------------------------------------
 
     def _senders(self, workspace):
         """The SenderBasis."""
@@ -145,24 +158,38 @@ class MeshlessPrecomputation:
         reflected = self.points.areas * self.points.albedo.mean(axis=1)
         flux = reflected @ irradiance
         # Each example counts alike, however much of its light falls on what reflects.
-        irradiance *= np.where(flux > 0, 1 / np.maximum(flux, np.float32(1e-30)), 0).astype(np.float32)
+        irradiance *= np.where(flux > 0, 1 / np.maximum(flux, np.float32(1e-30)), 0).astype(
+            np.float32
+        )
         importance = workspace.keep("importance", self._importance)
-        return fit_senders(irradiance, importance, self.clusters, settings.transfer_coefficients, settings.seed)
+        return fit_senders(
+            irradiance, importance, self.clusters, settings.transfer_coefficients, settings.seed
+        )
 
     def _importance(self):
-        """Random functionals (k, n) of irradiance: sums, with random signs, over what receivers get of it after one reflection."""
+        """Random functionals (k, n) of irradiance: sums, with random signs, over what receivers get
+        of it after one reflection.
+        """
         hemisphere = Hemisphere(IMPORTANCE_DIRECTIONS)
         tracer = HemisphereTracer(self.scene, self.samples, hemisphere, 1, self.lanes)
         n = len(self.points)
         random = np.random.default_rng(self.settings.seed)
-        receivers = random.standard_normal((n, FUNCTIONALS), dtype=np.float32) * np.sqrt(self.points.areas)[:, None]
+        receivers = (
+            random.standard_normal((n, FUNCTIONALS), dtype=np.float32)
+            * np.sqrt(self.points.areas)[:, None]
+        )
         result = np.zeros((n, FUNCTIONALS), np.float32)
         for cluster in self.clusters:
             seen = tracer.trace(cluster, cluster_frames(self.points.normals[cluster]))
             found = seen.sample != NOTHING
             ends = np.concatenate([[0], np.cumsum(found.sum(axis=1))])
             hops = scipy.sparse.csr_array(
-                ((seen.albedo[..., 0] * hemisphere.weights)[found], seen.sample[found].astype(np.int32), ends), (len(found), n)
+                (
+                    (seen.albedo[..., 0] * hemisphere.weights)[found],
+                    seen.sample[found].astype(np.int32),
+                    ends,
+                ),
+                (len(found), n),
             ).T
 
             def add(columns):
@@ -173,11 +200,15 @@ class MeshlessPrecomputation:
             self.progress("importance", cluster.stop, n, "")
         return np.ascontiguousarray(result.T)
 
-    # --- what clusters see ------------------------------------------------------------------------------------------
+    # --- what clusters see ------------------------------------------------------------------------
 
     def _clusters(self, workspace, senders):
-        """For each cluster: depth buffers, and with senders receivers, transfer in their basis, and what falls back on the senders."""
-        tracer = HemisphereTracer(self.scene, self.samples, self.hemisphere, self.channels, self.lanes)
+        """For each cluster: depth buffers, and with senders receivers, transfer in their basis, and
+        what falls back on the senders.
+        """
+        tracer = HemisphereTracer(
+            self.scene, self.samples, self.hemisphere, self.channels, self.lanes
+        )
         labels = self.samples.labels
         count = self._flat_sizes(senders)
         self.rays = len(self.points) * len(self.hemisphere)
@@ -185,12 +216,21 @@ class MeshlessPrecomputation:
         with closing(workspace.rows("clusters", len(self.clusters), 4 * count)) as rows:
             for number, cluster in enumerate(self.clusters):
                 if number >= rows.filled:
-                    rows.append(self._cluster(tracer, labels, senders, number, count)[None].view(np.uint8))
+                    rows.append(
+                        self._cluster(tracer, labels, senders, number, count)[None].view(np.uint8)
+                    )
                     traced += (cluster.stop - cluster.start) * len(self.hemisphere)
                 rate = traced / max(time.perf_counter() - started, 1e-9) / 1e6
-                self.progress("clusters", cluster.stop, len(self.points), f"{rate:.1f} million rays/s" if traced else "")
+                self.progress(
+                    "clusters",
+                    cluster.stop,
+                    len(self.points),
+                    f"{rate:.1f} million rays/s" if traced else "",
+                )
             for number in range(len(self.clusters)):
-                parts.append(self._unpacked(rows[number : number + 1].view(np.float32)[0], number, senders))
+                parts.append(
+                    self._unpacked(rows[number : number + 1].view(np.float32)[0], number, senders)
+                )
         return parts
 
     def _layout(self, number, senders):
@@ -217,20 +257,33 @@ class MeshlessPrecomputation:
         cluster = self.clusters[number]
         seen = tracer.trace(cluster, cluster_frames(self.points.normals[cluster]))
         settings = self.settings
-        mean, vectors, depth = compress(seen.distance, self.extent, self.hemisphere, settings.depth_coefficients, settings.seed)
+        mean, vectors, depth = compress(
+            seen.distance, self.extent, self.hemisphere, settings.depth_coefficients, settings.seed
+        )
         results = [mean, vectors, depth]
         if senders is not None:
             m = cluster.stop - cluster.start
-            hop = gathered(seen, self.hemisphere.weights, labels, len(self.clusters), senders.decoder)
+            hop = gathered(
+                seen, self.hemisphere.weights, labels, len(self.clusters), senders.decoder
+            )
             hop = hop.reshape(m, -1, self.channels)
             examples = senders.coefficients.reshape(hop.shape[1], -1)[:, :RESPONSES]
-            responses = np.concatenate([hop[..., i] @ examples for i in range(self.channels)], axis=1)
+            responses = np.concatenate(
+                [hop[..., i] @ examples for i in range(self.channels)], axis=1
+            )
             left, _, _ = leading_components(responses, RECEIVERS, settings.seed)
             receivers = np.zeros((m, RECEIVERS), np.float32)
             receivers[:, : left.shape[1]] = left
             surface = np.isfinite(seen.distance)
-            missed = np.array([(surface & (seen.sample == NOTHING)).sum(), surface.sum()], np.float32)
-            results += [receivers, _product(receivers.T, hop), _product(senders.encoder[cluster].T, hop), missed]
+            missed = np.array(
+                [(surface & (seen.sample == NOTHING)).sum(), surface.sum()], np.float32
+            )
+            results += [
+                receivers,
+                _product(receivers.T, hop),
+                _product(senders.encoder[cluster].T, hop),
+                missed,
+            ]
         flat = np.zeros(count, np.float32)
         joined = np.concatenate([np.ravel(x) for x in results])
         flat[: len(joined)] = joined
@@ -244,21 +297,31 @@ class MeshlessPrecomputation:
             first += size
         return parts
 
-    # --- transfer ---------------------------------------------------------------------------------------------------
+    # --- transfer ---------------------------------------------------------------------------------
 
     def _transfer(self, senders, parts):
-        """The Transfer, or None where nothing is reflected from point to point; and what is told of it."""
+        """The Transfer, or None where nothing is reflected from point to point; and what is told of
+        it.
+        """
         settings = self.settings
         missed, met = np.sum([part["missed"] for part in parts], axis=0, dtype=np.float64)
         back = np.concatenate([part["back"] for part in parts]).astype(np.float64)
         if not back.any():
             return None, {"bounces": 0}
         self.progress("reflections", 0, 1, "")
-        reflections = all_reflections(back, None if settings.bounces == "auto" else settings.bounces)
+        reflections = all_reflections(
+            back, None if settings.bounces == "auto" else settings.bounces
+        )
         one_hop = np.stack([part["transfer"] for part in parts])
         c, q, k, channels = one_hop.shape
         matrix = np.stack(
-            [(one_hop[..., i].reshape(c * q, k) @ reflections[..., i].astype(np.float32)).reshape(c, q, k) for i in range(channels)], axis=-1
+            [
+                (
+                    one_hop[..., i].reshape(c * q, k) @ reflections[..., i].astype(np.float32)
+                ).reshape(c, q, k)
+                for i in range(channels)
+            ],
+            axis=-1,
         )
         examples = senders.coefficients.reshape(k, -1)
         matrix, ranks, error = within_budget(matrix, examples, settings.transfer_error)
@@ -272,15 +335,19 @@ class MeshlessPrecomputation:
             "captured_response": senders.captured,
             "transfer_error": error,
             "transfer_rank": float(ranks.mean()),
-            "transfer_density": float((matrix != 0).sum() / max(int(ranks.sum()) * k * channels, 1)),
+            "transfer_density": float(
+                (matrix != 0).sum() / max(int(ranks.sum()) * k * channels, 1)
+            ),
             "unsampled_share": float(missed / max(met, 1)),
         }
         return Transfer(senders.encoder, receivers, matrix), report
 
-    # --- what was lost ----------------------------------------------------------------------------------------------
+    # --- what was lost ----------------------------------------------------------------------------
 
     def _quantization(self, exact, stored, senders):
-        """What 16-bit numbers change: of depth, as the largest relative error, and of indirect irradiance, under the examples."""
+        """What 16-bit numbers change: of depth, as the largest relative error, and of indirect
+        irradiance, under the examples.
+        """
         if self.settings.quantize == "none":
             return {"quantization": {"depth": 0.0, "indirect": 0.0}}
         worst = 0.0
@@ -295,10 +362,14 @@ class MeshlessPrecomputation:
         return {"quantization": {"depth": worst, "indirect": indirect}}
 
     def _visibility(self, depth):
-        """How often the depth buffers are wrong of whether a light is visible, and what direct irradiance is off, under some examples."""
+        """How often the depth buffers are wrong of whether a light is visible, and what direct
+        irradiance is off, under some examples.
+        """
         direct = LocalDirect(self.samples, depth)
         places = self.places[:: max(1, len(self.places) // VISIBILITY_LIGHTS)][:VISIBILITY_LIGHTS]
-        truth = np.concatenate([values for _, values in trace_examples(self.scene, self.points, places, self.lanes)])
+        truth = np.concatenate(
+            [values for _, values in trace_examples(self.scene, self.points, places, self.lanes)]
+        )
         wrong = facing = 0
         squares = []
         for place, expected in zip(places, truth.T):
@@ -306,7 +377,9 @@ class MeshlessPrecomputation:
             _, averaged = direct.irradiance(emission)
             open_air = _unblocked(self.points, place)
             above = open_air > 0
-            wrong += int(((averaged[:, 0] > open_air / 2) != (expected > open_air / 2))[above].sum())
+            wrong += int(
+                ((averaged[:, 0] > open_air / 2) != (expected > open_air / 2))[above].sum()
+            )
             facing += int(above.sum())
             norm = np.linalg.norm(expected)
             if norm > 0:
@@ -323,7 +396,9 @@ def _product(left, hop):
 
 
 def _unblocked(points, place):
-    """Irradiance (n,) of samples by a point light of unit intensity that nothing hides, averaged over their areas."""
+    """Irradiance (n,) of samples by a point light of unit intensity that nothing hides, averaged
+    over their areas.
+    """
     toward = place - points.positions
     height = np.einsum("ij,ij->i", toward, points.normals)
     across = np.einsum("ij,ij->i", toward, toward) - height**2
@@ -332,7 +407,9 @@ def _unblocked(points, place):
 
 
 def _own_light(scene):
-    """Emission of the scene's own local emitters, and why there is none, in words, where it has none or such as cannot be used."""
+    """Emission of the scene's own local emitters, and why there is none, in words, where it has
+    none or such as cannot be used.
+    """
     try:
         return emission_of(local_scene_light(scene)), ""
     except LightError as error:

@@ -1,11 +1,13 @@
-"""What precomputing a scene for local lights requires and costs, and what an asset of them holds."""
+"""What precomputing a scene for local lights requires and costs, and what an asset of them
+holds.
+"""
 
 import time
 from dataclasses import asdict, replace
 
-from .meshless import MeshlessPrecomputation
 from ..asset.meshless_file import compressed
 from ..asset.provenance import left_out
+from .meshless import MeshlessPrecomputation
 from .workspace import temporary
 
 FIRST_COUNT, PROBE_COUNT = 200, 3000  # samples of the runs that the cost is told from
@@ -35,9 +37,20 @@ def describe_meshless(scene, settings):
     n, width = settings.count, 2 if settings.quantize == "16" else 4
     clusters = max(1, round(n / settings.cluster_size))
     columns = clusters * settings.transfer_coefficients * probe.channels
-    depth = width * (n * settings.depth_coefficients + clusters * settings.depth_directions * (settings.depth_coefficients + 1))
+    depth = width * (
+        n * settings.depth_coefficients
+        + clusters * settings.depth_directions * (settings.depth_coefficients + 1)
+    )
     reflected = settings.bounces != 0
-    transfer = width * (n * (settings.transfer_coefficients + EXPECTED_RANK) + clusters * EXPECTED_RANK * columns // 2) if reflected else 0
+    transfer = (
+        width
+        * (
+            n * (settings.transfer_coefficients + EXPECTED_RANK)
+            + clusters * EXPECTED_RANK * columns // 2
+        )
+        if reflected
+        else 0
+    )
     report = probe.points.report
     return {
         "requires": {
@@ -50,22 +63,32 @@ def describe_meshless(scene, settings):
         },
         "settings": asdict(settings),
         "left_out": left_out(scene, local_lights=True),
-        "predicted": {"seconds": round(seconds * n, 1), "bytes": int(POINT_BYTES * n + depth + transfer)},
+        "predicted": {
+            "seconds": round(seconds * n, 1),
+            "bytes": int(POINT_BYTES * n + depth + transfer),
+        },
     }
 
 
 def _probe(scene, settings, count):
     """A whole run with fewer samples."""
-    job = MeshlessPrecomputation(scene, replace(settings, count=min(count, settings.count)), lambda *_: None, NO_LIMIT)
+    job = MeshlessPrecomputation(
+        scene, replace(settings, count=min(count, settings.count)), lambda *_: None, NO_LIMIT
+    )
     with temporary() as workspace:
         job.run(workspace, {}, lambda name: None)
     return job
 
 
 def describe_meshless_asset(asset):
-    """What `info.describe_asset` says of an asset of local lights; `storage` in bytes as in the file."""
+    """What `info.describe_asset` says of an asset of local lights; `storage` in bytes as in the
+    file.
+    """
     arrays = compressed(asset)
-    storage = {group: sum(a.nbytes for name, a in arrays.items() if name.startswith(group)) for group in GROUPS}
+    storage = {
+        group: sum(a.nbytes for name, a in arrays.items() if name.startswith(group))
+        for group in GROUPS
+    }
     return {
         "points": len(asset.points),
         "clusters": len(asset.samples.roots),

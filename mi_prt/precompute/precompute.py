@@ -11,6 +11,7 @@ import numpy as np
 import scipy.sparse
 
 from ..asset.asset import Asset
+from ..asset.provenance import describe_scene
 from ..basis.bases import fit_basis
 from ..basis.none import NoBasis
 from ..basis.rows import Rows
@@ -18,25 +19,34 @@ from ..basis.target import Fit, Target, check_room
 from ..basis.total import carrier, fit_total
 from ..directions import parse_directions
 from ..errors import SettingsError
-from .reflections import IndirectTransport, direct_report, surface_shares
-from ..system.memory import free_bytes, parse_bytes, resident_bytes
-from .meshless import MeshlessPrecomputation
-from ..system.parallel import BLOCK_ROWS, map_chunks
 from ..points.points import POINT_FIELDS, sample_points
-from ..asset.provenance import describe_scene
-from .budget import INDIRECT_LANE_BYTES, LANE_BYTES, Room, held_coefficient_bytes
-from ..system.runtime import count_kernels, peak_memory_bytes, versions
 from ..scene.scene import open_scene
-from .settings import MeshlessSettings, Settings, names_of
+from ..system.memory import free_bytes, parse_bytes, resident_bytes
+from ..system.parallel import BLOCK_ROWS, map_chunks
+from ..system.runtime import count_kernels, peak_memory_bytes, versions
 from ..transport.direct import DirectSampler, find_buried
 from ..transport.hops import blocked_share
+from .budget import INDIRECT_LANE_BYTES, LANE_BYTES, Room, held_coefficient_bytes
+from .meshless import MeshlessPrecomputation
+from .reflections import IndirectTransport, direct_report, surface_shares
+from .settings import MeshlessSettings, Settings, names_of
 from .workspace import durable, temporary
 
 STRICTER = 0.99  # margin of a second fit, for what is lost beside direct transport
-OPEN_KEYS = ("coefficients", "variance")  # what may be chosen anew when the fit could not give what was asked for
+# what may be chosen anew when the fit could not give what was asked for
+OPEN_KEYS = ("coefficients", "variance")
 
 
-def precompute(scene, parameters=None, progress=None, output=None, resume=False, max_memory=None, points="vertices", **settings):
+def precompute(
+    scene,
+    parameters=None,
+    progress=None,
+    output=None,
+    resume=False,
+    max_memory=None,
+    points="vertices",
+    **settings,
+):
     """Precompute a scene's transport.
 
     Parameters
@@ -45,21 +55,28 @@ def precompute(scene, parameters=None, progress=None, output=None, resume=False,
     parameters : dict, optional
         Values for an XML file's `<default>` parameters.
     progress : callable(stage, done, total, detail), optional
-        Called as work advances. With points='vertices' the stages are 'transport' and 'indirect' (in points, whose rays are traced block by
-        block; the detail is rays per second), 'basis' (in passes over the rows), 'coefficients' (in points) and 'reflections' (in
-        coefficients); with points='samples' they are 'samples', 'example lights', 'importance', 'clusters' (in points) and 'reflections'.
+        Called as work advances. With points='vertices' the stages are 'transport' and 'indirect'
+        (in points, whose rays are traced block by block; the detail is rays per second), 'basis'
+        (in passes over the rows), 'coefficients' (in points) and 'reflections' (in coefficients);
+        with points='samples' they are 'samples', 'example lights', 'importance', 'clusters' (in
+        points) and 'reflections'.
     output : path, optional
-        File to save the asset to. What is computed on the way is kept beside it, in a folder with `.partial` behind the name,
-        until the file is whole: a run that was interrupted or killed can be continued.
+        File to save the asset to. What is computed on the way is kept beside it, in a folder with
+        `.partial` behind the name, until the file is whole: a run that was interrupted or killed
+        can be continued.
     resume : bool
-        Continue the unfinished run of `output`, if there is one. The file is the same as that of an undisturbed run.
+        Continue the unfinished run of `output`, if there is one. The file is the same as that of an
+        undisturbed run.
     max_memory : int or str, optional
-        Bytes, or such as '3G', that this process may have resident. By default what it has now and half of what is free.
+        Bytes, or such as '3G', that this process may have resident. By default what it has now and
+        half of what is free.
     points : 'vertices' or 'samples'
-        Vertices of the (tessellated) surfaces, for distant light; or meshless samples, for lights that move inside the scene.
+        Vertices of the (tessellated) surfaces, for distant light; or meshless samples, for lights
+        that move inside the scene.
     **settings
-        Fields of `Settings` (directions, basis, coefficients, variance, edge_length, rays_per_direction, bounces, indirect,
-        paths_per_point, denoise, seed), or of `MeshlessSettings` (count, cluster_size, depth_directions, depth_coefficients,
+        Fields of `Settings` (directions, basis, coefficients, variance, edge_length,
+        rays_per_direction, bounces, indirect, paths_per_point, denoise, seed), or of
+        `MeshlessSettings` (count, cluster_size, depth_directions, depth_coefficients,
         example_lights, transfer_coefficients, transfer_error, quantize, bounces, seed).
 
     Returns
@@ -70,12 +87,22 @@ def precompute(scene, parameters=None, progress=None, output=None, resume=False,
     Raises
     ------
     SceneError, SettingsError
-        See `open_scene`, `sample_points`, `scatter_samples`, `Settings`, `MeshlessSettings`, `workspace.durable`.
+        See `open_scene`, `sample_points`, `scatter_samples`, `Settings`, `MeshlessSettings`,
+        `workspace.durable`.
     """
     return measure(scene, parameters, progress, output, resume, max_memory, points, **settings)[0]
 
 
-def measure(scene, parameters=None, progress=None, output=None, resume=False, max_memory=None, points="vertices", **settings):
+def measure(
+    scene,
+    parameters=None,
+    progress=None,
+    output=None,
+    resume=False,
+    max_memory=None,
+    points="vertices",
+    **settings,
+):
     """`precompute`, and what it cost.
 
     Returns
@@ -90,13 +117,17 @@ def measure(scene, parameters=None, progress=None, output=None, resume=False, ma
     known = names_of(kind)
     foreign = [name for name in settings if name not in known]
     if foreign:
-        raise SettingsError(f"{foreign[0]} is no setting of points '{points}', which has {', '.join(known)}")
+        raise SettingsError(
+            f"{foreign[0]} is no setting of points '{points}', which has {', '.join(known)}"
+        )
     settings = kind(**settings)
     if output is not None:
         output = Path(output).resolve()
     elif resume:
         raise SettingsError("resume needs the output of the run to continue")
-    limit = parse_bytes(max_memory) if max_memory is not None else resident_bytes() + free_bytes() // 2
+    limit = (
+        parse_bytes(max_memory) if max_memory is not None else resident_bytes() + free_bytes() // 2
+    )
     progress = progress or (lambda stage, done, total, detail="": None)
     clock = _Clock()
     with count_kernels() as kernels:
@@ -118,7 +149,9 @@ def measure(scene, parameters=None, progress=None, output=None, resume=False, ma
 @contextmanager
 def _workspace(output, identity, resume, open_keys=()):
     """Where intermediate results are; the caller saves the asset within the block."""
-    with temporary() if output is None else durable(output, identity, resume, open_keys) as workspace:
+    with (
+        temporary() if output is None else durable(output, identity, resume, open_keys)
+    ) as workspace:
         yield workspace
 
 
@@ -148,7 +181,9 @@ def _for_distant_light(scene, description, settings, progress, output, resume, l
             dark = transport.dark()
             buried = find_buried(scene, points, dark, room.lanes)
             clock.lap("transport")
-            job = _Compression(scene, points, directions, settings, target, room, workspace, run, progress)
+            job = _Compression(
+                scene, points, directions, settings, target, room, workspace, run, progress
+            )
             fit, coefficients, reflections = job.run(transport, buried, clock)
         asset = Asset(
             points,
@@ -157,7 +192,11 @@ def _for_distant_light(scene, description, settings, progress, output, resume, l
             fit.basis,
             coefficients,
             scene=description,
-            settings=asdict(settings) | {"coefficients": len(fit.basis), "edge_length": points.report["edge_length"]},
+            settings=asdict(settings)
+            | {
+                "coefficients": len(fit.basis),
+                "edge_length": points.report["edge_length"],
+            },
             versions=versions(),
             report={
                 "rays": transport.rays,
@@ -174,7 +213,10 @@ def _for_distant_light(scene, description, settings, progress, output, resume, l
     return asset
 
 
-POINTS = {"vertices": (Settings, _for_distant_light), "samples": (MeshlessSettings, _for_local_lights)}
+POINTS = {
+    "vertices": (Settings, _for_distant_light),
+    "samples": (MeshlessSettings, _for_local_lights),
+}
 
 
 def _identity(settings, scene, points):
@@ -182,7 +224,12 @@ def _identity(settings, scene, points):
     digest = hashlib.sha256((scene.hash + scene.appearance).encode())
     for name in POINT_FIELDS:
         digest.update(np.ascontiguousarray(getattr(points, name)).tobytes())
-    return {"scene": digest.hexdigest()[:16], "points": len(points), **asdict(settings), "versions": versions()}
+    return {
+        "scene": digest.hexdigest()[:16],
+        "points": len(points),
+        **asdict(settings),
+        "versions": versions(),
+    }
 
 
 def _trace(stage, sampler, rows, progress):
@@ -213,7 +260,8 @@ class _Compression:
     def run(self, transport, buried, clock):
         """Fit, coefficients and what is told of reflections."""
         settings = self.settings
-        kept = ~buried if not buried.all() else ~np.zeros_like(buried)  # buried points would only pull the basis
+        # buried points would only pull the basis
+        kept = ~buried if not buried.all() else ~np.zeros_like(buried)
         blocked = blocked_share(transport, self.directions.solid_angles)
         report = direct_report(float((1 - blocked) @ surface_shares(self.points, buried)))
         if settings.basis == "none":
@@ -231,13 +279,24 @@ class _Compression:
         return fit, coefficients, report
 
     def _with_reflections(self, fit, transport, buried, blocked, kept):
-        """Fit, coefficients and report of total transport; None where no light is reflected to any point."""
+        """Fit, coefficients and report of total transport; None where no light is reflected to any
+        point.
+        """
         while True:
             carried = carrier(fit.basis)
             direct = self._encode(carried, transport)
             lanes = max(1, self.room.lanes * LANE_BYTES // INDIRECT_LANE_BYTES)
             indirect = IndirectTransport(
-                self.scene, self.points, buried, transport, self.directions, self.settings, carried, direct, blocked, lanes
+                self.scene,
+                self.points,
+                buried,
+                transport,
+                self.directions,
+                self.settings,
+                carried,
+                direct,
+                blocked,
+                lanes,
             )
             coefficients, growth, report = indirect.coefficients(
                 self.workspace, lambda *job: _trace(*job, self.progress), self.progress
@@ -245,16 +304,25 @@ class _Compression:
             if coefficients is None:
                 return None
             direct = direct[:, : len(carried.span)]
-            total, coefficients = fit_total(fit, self.target, carried.span, direct, coefficients, growth, kept)
+            total, coefficients = fit_total(
+                fit, self.target, carried.span, direct, coefficients, growth, kept
+            )
             wanted = self.target.variance
             if wanted is None or total.captured_variance >= wanted:
                 return total, coefficients, report
-            # Reflections make transport vary less: direct transport has to be compressed with less loss.
-            before, share = fit, 1 - STRICTER * (1 - wanted) * total.variance / max(growth * fit.variance, 1e-300)
+            # Reflections make transport vary less: direct transport has to be compressed with less
+            # loss.
+            before, share = (
+                fit,
+                1 - STRICTER * (1 - wanted) * total.variance / max(growth * fit.variance, 1e-300),
+            )
             fit = self._fit(transport, kept, Target(variance=share))
             if len(fit.basis) <= len(before.basis):
                 with self._open_to_choice():
-                    raise SettingsError(f"no number of coefficients captures {wanted} of the variance of total transport: ask for less")
+                    raise SettingsError(
+                        f"no number of coefficients captures {wanted} of the variance of total"
+                        " transport: ask for less"
+                    )
 
     def _fit(self, transport, kept, target):
         """The basis of direct transport."""
@@ -269,37 +337,60 @@ class _Compression:
                 self.room.basis,
                 self.workspace.keep,
             )
-            if settings.coefficients not in (None, "auto") and len(fit.basis) < settings.coefficients:
+            if (
+                settings.coefficients not in (None, "auto")
+                and len(fit.basis) < settings.coefficients
+            ):
                 raise SettingsError(
-                    f"{settings.coefficients} coefficients are above the rank of the transport: at most {len(fit.basis)}"
+                    f"{settings.coefficients} coefficients are above the rank of the transport: at"
+                    f" most {len(fit.basis)}"
                 )
             if target.components is None:
-                size = held_coefficient_bytes(settings, *transport.shape, len(fit.basis), self.room.channels)
-                check_room(f"keeping {len(fit.basis):,} coefficients of {len(kept):,} points", size, self.room.basis)
+                size = held_coefficient_bytes(
+                    settings, *transport.shape, len(fit.basis), self.room.channels
+                )
+                check_room(
+                    f"keeping {len(fit.basis):,} coefficients of {len(kept):,} points",
+                    size,
+                    self.room.basis,
+                )
         return fit
 
     @contextmanager
     def _open_to_choice(self):
-        """Within the block, an error of what only a fit can tell leaves the run open to another choice of coefficients, or more memory."""
+        """Within the block, an error of what only a fit can tell leaves the run open to another
+        choice of coefficients, or more memory.
+        """
         try:
             yield
         except SettingsError as error:
             if not self.workspace.lasting:
                 raise
-            # The rays are kept; the passes of this fit are not, because another one may start elsewhere.
+            # The rays are kept; the passes of this fit are not, because another one may start
+            # elsewhere.
             self.workspace.forget_arrays()
-            self.workspace.record({key: value for key, value in self.identity.items() if key not in OPEN_KEYS})
-            raise SettingsError(f"all rays are traced and kept, resume (--resume) goes on from them, but {error}") from None
+            self.workspace.record(
+                {key: value for key, value in self.identity.items() if key not in OPEN_KEYS}
+            )
+            raise SettingsError(
+                f"all rays are traced and kept, resume (--resume) goes on from them, but {error}"
+            ) from None
 
     def _encode(self, basis, transport):
         """Coefficients of all points, block by block."""
         n, _ = transport.shape
         starts = range(0, n, BLOCK_ROWS)
         blocks = []
-        for block in map_chunks(lambda first: basis.encode(transport.rows(slice(first, first + BLOCK_ROWS))), starts):
+        for block in map_chunks(
+            lambda first: basis.encode(transport.rows(slice(first, first + BLOCK_ROWS))), starts
+        ):
             blocks.append(block)
             self.progress("coefficients", min(len(blocks) * BLOCK_ROWS, n), n, "")
-        return scipy.sparse.vstack(blocks, format="csr") if scipy.sparse.issparse(blocks[0]) else np.concatenate(blocks)
+        return (
+            scipy.sparse.vstack(blocks, format="csr")
+            if scipy.sparse.issparse(blocks[0])
+            else np.concatenate(blocks)
+        )
 
 
 class _Clock:

@@ -1,4 +1,6 @@
-"""Indirect transport: whether a scene calls for it, how many rays it takes, and what it adds to direct transport's coefficients."""
+"""Indirect transport: whether a scene calls for it, how many rays it takes, and what it adds to
+direct transport's coefficients.
+"""
 
 import zlib
 from contextlib import closing
@@ -7,12 +9,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..transport.hops import NOTHING, Hops, HopSampler
-from ..transport.interreflection import MOST_SUMMED_BOUNCES, BounceSplit, check_ending, combined, solve, split_by_bounces
+from ..transport.interreflection import (
+    MOST_SUMMED_BOUNCES,
+    BounceSplit,
+    check_ending,
+    combined,
+    solve,
+    split_by_bounces,
+)
 from ..transport.paths import ENERGY_BINS, PathSampler
 
 PILOT_POINTS = 256
 PILOT_RAYS = 64
-NOISE_TOLERANCE = 0.01  # noise of indirect transport that `auto` aims at, as a share of the norm of direct transport
+# noise of indirect transport that `auto` aims at, as a share of the norm of direct transport
+NOISE_TOLERANCE = 0.01
 LEAST_RAYS, MOST_RAYS = 64, 1024  # of `auto`, from each point
 GREY = 1e-3  # difference between the channels of an albedo that is taken for grey
 
@@ -72,23 +82,45 @@ class IndirectTransport:
         few = np.sort(np.random.default_rng(settings.seed).permutation(seeing)[:PILOT_POINTS])
         hops = self._hop_sampler(PILOT_RAYS).rows(few)
         seen = hops["point"] != NOTHING
-        coloured = any(np.ptp(x, axis=-1).max(initial=0) > GREY for x in (self.points.albedo, hops["albedo"][seen]))
+        coloured = any(
+            np.ptp(x, axis=-1).max(initial=0) > GREY
+            for x in (self.points.albedo, hops["albedo"][seen])
+        )
         if settings.bounces == "auto":
-            check_ending(max(float(x.max(initial=0.0)) for x in (self.points.albedo, hops["albedo"][seen])))
+            check_ending(
+                max(float(x.max(initial=0.0)) for x in (self.points.albedo, hops["albedo"][seen]))
+            )
         rays = settings.paths_per_point
         if rays == "auto":
-            first, second = self._hop_halves(few, hops, seen) if settings.indirect == "solve" else self._path_halves(few)
-            # With a single ray from each point; strata make it less. Points that see nothing have none.
+            first, second = (
+                self._hop_halves(few, hops, seen)
+                if settings.indirect == "solve"
+                else self._path_halves(few)
+            )
+            # With a single ray from each point; strata make it less. Points that see nothing have
+            # none.
             m = len(self.carrier.span)
-            noise = PILOT_RAYS / 4 * float(np.sum(np.square(first - second)[:, :m])) / len(few) * len(seeing)
-            wanted = noise / max(NOISE_TOLERANCE**2 * float(np.sum(np.square(self.direct[~self.buried, :m]))), 1e-300)
+            noise = (
+                PILOT_RAYS
+                / 4
+                * float(np.sum(np.square(first - second)[:, :m]))
+                / len(few)
+                * len(seeing)
+            )
+            wanted = noise / max(
+                NOISE_TOLERANCE**2 * float(np.sum(np.square(self.direct[~self.buried, :m]))), 1e-300
+            )
             rays = 1 << int(np.ceil(np.log2(np.clip(wanted, LEAST_RAYS, MOST_RAYS))))
         return Demand(rays, 3 if coloured else 1)
 
     def _hop_halves(self, few, hops, seen):
-        """What is carried (few, m + p) of light after one reflection, by every other ray and by the rest."""
+        """What is carried (few, m + p) of light after one reflection, by every other ray and by the
+        rest.
+        """
         arriving = np.zeros((*hops.shape, self.direct.shape[1]), np.float32)
-        arriving[seen] = self.direct[hops["point"][seen]] * hops["albedo"][seen].mean(axis=-1, keepdims=True)
+        arriving[seen] = self.direct[hops["point"][seen]] * hops["albedo"][seen].mean(
+            axis=-1, keepdims=True
+        )
         return [self.blocked[few, None] * arriving[:, first::2].mean(axis=1) for first in (0, 1)]
 
     def _path_halves(self, few):
@@ -122,32 +154,44 @@ class IndirectTransport:
             If any number of reflections is wanted and they do not end.
         """
         demand = self._demand()
-        halves, split = (self._solved if self.settings.indirect == "solve" else self._traced)(demand, workspace, trace, progress)
+        halves, split = (self._solved if self.settings.indirect == "solve" else self._traced)(
+            demand, workspace, trace, progress
+        )
         if split.bounces == 0:
             return None, 0.0, direct_report(split.energy[0])
         m, kept = len(self.carrier.span), ~self.buried
         growth = self._growth([half[..., m:] for half in halves], kept)
-        coefficients, noise, passed = combined([half[..., :m] for half in halves], kept, self.settings.denoise)
+        coefficients, noise, passed = combined(
+            [half[..., :m] for half in halves], kept, self.settings.denoise
+        )
         total = float(np.linalg.norm(self.direct[kept, :m])) * demand.channels**0.5
-        return coefficients, growth, {
-            "bounces": split.bounces,
-            "bounce_energy": [float(f"{x:.6g}") for x in split.energy],
-            "bounce_energy_left": split.left if np.isfinite(split.left) else None,
-            "channels": demand.channels,
-            "paths_per_point": demand.rays,
-            "indirect_noise": noise / max(total, 1e-300),
-            "indirect_noise_passed": passed**0.5,
-        }
+        return (
+            coefficients,
+            growth,
+            {
+                "bounces": split.bounces,
+                "bounce_energy": [float(f"{x:.6g}") for x in split.energy],
+                "bounce_energy_left": split.left if np.isfinite(split.left) else None,
+                "channels": demand.channels,
+                "paths_per_point": demand.rays,
+                "indirect_noise": noise / max(total, 1e-300),
+                "indirect_noise_passed": passed**0.5,
+            },
+        )
 
     def _growth(self, halves, kept):
-        """Of what the coefficients leave out: squared norm after reflections, summed over channels, over that before, by the probes."""
+        """Of what the coefficients leave out: squared norm after reflections, summed over channels,
+        over that before, by the probes.
+        """
         lost = self.direct[kept, len(self.carrier.span) :]
         # Noise of the two halves is independent, and so has no part in the mean of their product.
         after = sum(float(np.vdot(lost + a[kept], lost + b[kept])) for a, b in zip(*halves))
         return max(after, 0.0) / max(float(np.vdot(lost, lost)), 1e-300)
 
     def _solved(self, demand, workspace, trace, progress):
-        """Two independent estimates (c, n, m + p) by a series of hops, None where there is no light; and the BounceSplit."""
+        """Two independent estimates (c, n, m + p) by a series of hops, None where there is no
+        light; and the BounceSplit.
+        """
         sampler = self._hop_sampler(demand.rays)
         m, channels = self.direct.shape[1], demand.channels
         with closing(workspace.rows("hops", len(self.points), sampler.row_bytes)) as rays:
@@ -159,7 +203,13 @@ class IndirectTransport:
                 return None, split
             summed = None if self._most is None and split.bounces > MOST_SUMMED_BOUNCES else split
             halves = [
-                solve(half, self.direct, channels, summed, lambda done: progress("reflections", i * m + done, 2 * m, ""))
+                solve(
+                    half,
+                    self.direct,
+                    channels,
+                    summed,
+                    lambda done: progress("reflections", i * m + done, 2 * m, ""),
+                )
                 for i, half in enumerate(hops.halves())
             ]
         return halves, split if summed else replace(split, left=0.0)
@@ -185,15 +235,36 @@ class IndirectTransport:
 
     def _hop_sampler(self, rays):
         seed = self.settings.seed
-        return HopSampler(self.scene, self.points, self.buried, self.transport, self.directions, rays, seed, self.lanes)
+        return HopSampler(
+            self.scene,
+            self.points,
+            self.buried,
+            self.transport,
+            self.directions,
+            rays,
+            seed,
+            self.lanes,
+        )
 
     def _path_sampler(self, demand, points):
         seed, encode = self.settings.seed, self.carrier.encode
-        return PathSampler(self.scene, points, self.directions, demand.rays, self._most, demand.channels, encode, seed, self.lanes)
+        return PathSampler(
+            self.scene,
+            points,
+            self.directions,
+            demand.rays,
+            self._most,
+            demand.channels,
+            encode,
+            seed,
+            self.lanes,
+        )
 
 
 def direct_report(energy):
-    """What an asset reports of reflections where there are none, given the energy of direct light (see `BounceSplit`)."""
+    """What an asset reports of reflections where there are none, given the energy of direct light
+    (see `BounceSplit`).
+    """
     return {"bounces": 0, "bounce_energy": [float(f"{energy:.6g}")], "channels": 1}
 
 
@@ -204,7 +275,9 @@ def surface_shares(points, buried):
 
 
 def _unpacked(rows, channels, m):
-    """Coefficients (2, c, n, m) of both halves of the paths, and energies (n, 64), from the rows of `PathSampler`."""
+    """Coefficients (2, c, n, m) of both halves of the paths, and energies (n, 64), from the rows of
+    `PathSampler`.
+    """
     rows = np.ascontiguousarray(rows).view(np.float32)
     halves = rows[:, :-ENERGY_BINS].reshape(len(rows), 2, channels, m)
     return np.ascontiguousarray(halves.transpose(1, 2, 0, 3)), rows[:, -ENERGY_BINS:]

@@ -15,7 +15,8 @@ MAX_RAYS_PER_DIRECTION = 64
 MAX_BOUNCES = 10_000
 MAX_PATHS = 1 << 16
 INDIRECT = ("solve", "paths")
-DIRECT_ONLY = ("haar", "none")  # bases whose coefficients are picked from, or are, rows of direct transport
+# bases whose coefficients are picked from, or are, rows of direct transport
+DIRECT_ONLY = ("haar", "none")
 _INTEGERS = {  # settings that are integers, and what else they may be
     "coefficients": (None, "auto"),
     "rays_per_direction": (),
@@ -34,11 +35,12 @@ class Settings:
     directions : str
         Direction lattice: ``cubemap:N``, ``latlong:WxH`` or ``halton:N``.
     basis : str
-        ``pca``, ``sh`` (spherical harmonics), ``haar`` (the best wavelets of each point), ``haar-shared`` (the same for all
-        points) or ``none`` (transport as it was sampled).
+        ``pca``, ``sh`` (spherical harmonics), ``haar`` (the best wavelets of each point),
+        ``haar-shared`` (the same for all points) or ``none`` (transport as it was sampled).
     coefficients : int, 'auto' or None
-        Components of the basis. None takes 48 (49 harmonics), or the rank of the transport where that is lower; an explicit
-        number above the rank is refused; 'auto' takes as few as capture `variance`.
+        Components of the basis. None takes 48 (49 harmonics), or the rank of the transport where
+        that is lower; an explicit number above the rank is refused; 'auto' takes as few as capture
+        `variance`.
     variance : float or None
         Share of the transport's variance that 'auto' captures, 0.95 by default.
     edge_length : 'auto' or float
@@ -46,17 +48,18 @@ class Settings:
     rays_per_direction : int
         Rays in each cell of the lattice, 1…64.
     bounces : int, 'auto' or None
-        Most reflections of light on its way to a point: 0 is direct light alone, 'auto' as many as it takes until less than 0.1 % of
-        the light is left (none where no point sees another). None is 'auto', and 0 for the bases `haar` and `none`, which hold
-        direct transport only.
+        Most reflections of light on its way to a point: 0 is direct light alone, 'auto' as many as
+        it takes until less than 0.1 % of the light is left (none where no point sees another). None
+        is 'auto', and 0 for the bases `haar` and `none`, which hold direct transport only.
     indirect : str
-        How reflections are computed: ``solve`` (one traced hop between points, and a series in coefficient space) or ``paths``
-        (path tracing from each point: unbiased, and noisier).
+        How reflections are computed: ``solve`` (one traced hop between points, and a series in
+        coefficient space) or ``paths`` (path tracing from each point: unbiased, and noisier).
     paths_per_point : int or 'auto'
-        Rays (`solve`) or paths (`paths`) from each point; 'auto' takes so many, 64…1024, that their noise is about
-        1 % of the transport, as a pilot tells.
+        Rays (`solve`) or paths (`paths`) from each point; 'auto' takes so many, 64…1024, that their
+        noise is about 1 % of the transport, as a pilot tells.
     denoise : bool
-        Whether components of indirect transport are scaled by the share of their variance that is signal.
+        Whether components of indirect transport are scaled by the share of their variance that is
+        signal.
     seed : int
 
     Raises
@@ -83,20 +86,29 @@ class Settings:
         check_basis(self.basis)
         for name, others in _INTEGERS.items():
             value = getattr(self, name)
-            if any(value is other or (isinstance(value, str) and value == other) for other in others):
+            if any(
+                value is other or (isinstance(value, str) and value == other) for other in others
+            ):
                 continue
             if isinstance(value, bool) or not isinstance(value, int | np.integer):
-                raise SettingsError(f"{name} must be an integer{' or auto' if others else ''}, got {value!r}")
+                raise SettingsError(
+                    f"{name} must be an integer{' or auto' if others else ''}, got {value!r}"
+                )
             plain[name] = int(value)
         for name in ("variance", "edge_length"):
             value = getattr(self, name)
-            if value is not None and not (name == "edge_length" and isinstance(value, str) and value == "auto"):
+            if value is not None and not (
+                name == "edge_length" and isinstance(value, str) and value == "auto"
+            ):
                 plain[name] = _number(name, value)
         # Plain values of one type each: they are stored, and compared when a run is continued.
         for name, value in plain.items():
             object.__setattr__(self, name, value)
         if not 1 <= self.rays_per_direction <= MAX_RAYS_PER_DIRECTION:
-            raise SettingsError(f"rays per direction must be 1…{MAX_RAYS_PER_DIRECTION}, got {self.rays_per_direction}")
+            raise SettingsError(
+                f"rays per direction must be 1…{MAX_RAYS_PER_DIRECTION}, got"
+                f" {self.rays_per_direction}"
+            )
         if self.seed < 0:
             raise SettingsError(f"seed must be ≥ 0, got {self.seed}")
         self._check_coefficients(lattice)
@@ -109,29 +121,41 @@ class Settings:
             raise SettingsError(f"bounces must be auto or 0…{MAX_BOUNCES}, got {self.bounces}")
         if self.bounces != 0 and self.basis in DIRECT_ONLY:
             raise SettingsError(
-                f"the basis {self.basis} holds direct transport only, got bounces {self.bounces}: use bounces 0, or the basis pca, sh or "
-                "haar-shared"
+                f"the basis {self.basis} holds direct transport only, got bounces {self.bounces}:"
+                " use bounces 0, or the basis pca, sh or haar-shared"
             )
         if self.indirect not in INDIRECT:
-            raise SettingsError(f"indirect '{self.indirect}' is not known: use {' or '.join(INDIRECT)}")
+            raise SettingsError(
+                f"indirect '{self.indirect}' is not known: use {' or '.join(INDIRECT)}"
+            )
         if not isinstance(self.denoise, bool):
             raise SettingsError(f"denoise must be true or false, got {self.denoise!r}")
         paths = self.paths_per_point
         if paths != "auto" and (not 2 <= paths <= MAX_PATHS or paths % 2):
-            raise SettingsError(f"paths per point must be auto or an even number 2…{MAX_PATHS:,}, got {paths}")
+            raise SettingsError(
+                f"paths per point must be auto or an even number 2…{MAX_PATHS:,}, got {paths}"
+            )
 
     def _check_coefficients(self, lattice):
         if self.basis == "none" and self.coefficients is not None:
-            raise SettingsError(f"the basis none keeps all directions, so coefficients {self.coefficients} mean nothing: leave them out")
+            raise SettingsError(
+                f"the basis none keeps all directions, so coefficients {self.coefficients} mean"
+                " nothing: leave them out"
+            )
         if self.coefficients == "auto":
             if self.variance is None:
                 object.__setattr__(self, "variance", DEFAULT_VARIANCE)
             Target(variance=self.variance)
         elif self.variance is not None:
-            raise SettingsError(f"variance {self.variance:g} needs coefficients auto, got {self.coefficients or 'the default'}")
+            raise SettingsError(
+                f"variance {self.variance:g} needs coefficients auto, got"
+                f" {self.coefficients or 'the default'}"
+            )
         elif self.coefficients is not None and self.coefficients < 0:
             raise SettingsError(f"coefficients must be ≥ 0, got {self.coefficients}")
-        check_components(self.basis, lattice, None if self.coefficients == "auto" else self.coefficients)
+        check_components(
+            self.basis, lattice, None if self.coefficients == "auto" else self.coefficients
+        )
 
     def target(self, points):
         """What the basis of so many points is asked for, a Target."""
@@ -143,8 +167,8 @@ class Settings:
         largest = most_components(self.basis, directions, points)
         if self.coefficients > largest:
             raise SettingsError(
-                f"{self.coefficients} coefficients are above the rank of the transport: {points:,} points and "
-                f"{len(directions):,} directions allow at most {largest}"
+                f"{self.coefficients} coefficients are above the rank of the transport: {points:,}"
+                f" points and {len(directions):,} directions allow at most {largest}"
             )
         return Target(int(self.coefficients))
 
@@ -179,7 +203,8 @@ class MeshlessSettings:
     transfer_coefficients : int
         Components of direct light on each cluster.
     transfer_error : float
-        Relative RMS error of indirect irradiance that may be made by dropping small parts of the transfer matrices; 0 drops none.
+        Relative RMS error of indirect irradiance that may be made by dropping small parts of the
+        transfer matrices; 0 drops none.
     quantize : '16' or 'none'
         Bits of an integer in the place of float32.
     bounces : int or 'auto'
@@ -220,17 +245,28 @@ class MeshlessSettings:
             if name == "bounces" and value in (None, "auto"):
                 object.__setattr__(self, name, "auto")
                 continue
-            if isinstance(value, bool) or not isinstance(value, int | np.integer) or not low <= value <= high:
-                raise SettingsError(f"{words} must be an integer {low}…{high:,}{' or auto' if name == 'bounces' else ''}, got {value!r}")
+            if (
+                isinstance(value, bool)
+                or not isinstance(value, int | np.integer)
+                or not low <= value <= high
+            ):
+                raise SettingsError(
+                    f"{words} must be an integer"
+                    f" {low}…{high:,}{' or auto' if name == 'bounces' else ''}, got {value!r}"
+                )
             object.__setattr__(self, name, int(value))
         Hemisphere(self.depth_directions)
         error = _number("transfer_error", self.transfer_error)
         if not 0 <= error < 1:
-            raise SettingsError(f"transfer error must be at least 0 and below 1, got {self.transfer_error}")
+            raise SettingsError(
+                f"transfer error must be at least 0 and below 1, got {self.transfer_error}"
+            )
         object.__setattr__(self, "transfer_error", error)
         object.__setattr__(self, "quantize", str(self.quantize))
         if self.quantize not in QUANTIZATIONS:
-            raise SettingsError(f"quantize '{self.quantize}' is not known: use {' or '.join(QUANTIZATIONS)}")
+            raise SettingsError(
+                f"quantize '{self.quantize}' is not known: use {' or '.join(QUANTIZATIONS)}"
+            )
 
 
 def names_of(settings):

@@ -1,8 +1,9 @@
 """Durable intermediate results: what a killed run had computed is there for the next one.
 
-A workspace is a folder beside the output. Nothing in it is believed without proof: rows are listed in a journal with their
-checksums after they are written, arrays carry theirs and are renamed into place when they are whole, and the folder belongs to
-one process, one scene and one choice of settings. The output itself appears only when it is complete.
+A workspace is a folder beside the output. Nothing in it is believed without proof: rows are listed
+in a journal with their checksums after they are written, arrays carry theirs and are renamed into
+place when they are whole, and the folder belongs to one process, one scene and one choice of
+settings. The output itself appears only when it is complete.
 """
 
 import fcntl
@@ -72,8 +73,8 @@ class Workspace:
 class RowFile:
     """Rows of bytes appended to a file, and read back without holding them in memory.
 
-    Rows count once the journal beside the file lists them; a block whose checksum does not fit was cut short, and it and
-    all later ones are dropped.
+    Rows count once the journal beside the file lists them; a block whose checksum does not fit was
+    cut short, and it and all later ones are dropped.
 
     Parameters
     ----------
@@ -137,7 +138,8 @@ class RowFile:
         start, wanted = first * self.row_bytes, (last - first) * self.row_bytes
         parts = []
         while wanted > 0:
-            # At a place of its own in every call: threads share the file. The system may give less than it is asked for.
+            # At a place of its own in every call: threads share the file. The system may give less
+            # than it is asked for.
             part = os.pread(self._file.fileno(), wanted, start)
             if not part:
                 break
@@ -160,7 +162,8 @@ def temporary():
 
 @contextmanager
 def durable(output, run, resume, open_keys=()):
-    """The workspace of an output file. It stays when the block fails or the process dies, and is deleted when the block ends.
+    """The workspace of an output file. It stays when the block fails or the process dies, and is
+    deleted when the block ends.
 
     Parameters
     ----------
@@ -171,13 +174,14 @@ def durable(output, run, resume, open_keys=()):
     resume : bool
         Whether to continue what is there; if there is nothing, the run starts.
     open_keys : sequence of str
-        Keys of `run` that an unfinished run may have left open (see `Workspace.record`): they may be chosen anew.
+        Keys of `run` that an unfinished run may have left open (see `Workspace.record`): they may
+        be chosen anew.
 
     Raises
     ------
     SettingsError
-        If there is an unfinished run and `resume` is not set, or it was another run, or another process works on it; or if the
-        folder holds anything that is not ours.
+        If there is an unfinished run and `resume` is not set, or it was another run, or another
+        process works on it; or if the folder holds anything that is not ours.
     """
     output = Path(output)
     check_writable(output)
@@ -195,11 +199,15 @@ def durable(output, run, resume, open_keys=()):
 
 
 def _lock(folder):
-    """The kernel's own lock on a folder, made if need be, as a file handle: it ends with the process, however that ends."""
+    """The kernel's own lock on a folder, made if need be, as a file handle: it ends with the
+    process, however that ends.
+    """
     while True:
         folder.mkdir(exist_ok=True)
         if folder.is_symlink():
-            raise SettingsError(f"'{folder}', for what a run can continue from, is a link: delete it")
+            raise SettingsError(
+                f"'{folder}', for what a run can continue from, is a link: delete it"
+            )
         try:
             handle = os.open(folder, os.O_RDONLY)
         except FileNotFoundError:  # another process ended and removed it just now
@@ -208,10 +216,13 @@ def _lock(folder):
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             os.close(handle)
-            raise SettingsError(f"another process is at work in '{folder}': wait for it, or choose another output") from None
+            raise SettingsError(
+                f"another process is at work in '{folder}': wait for it, or choose another output"
+            ) from None
         if folder.exists() and os.path.samestat(os.fstat(handle), os.stat(folder)):
             return handle
-        os.close(handle)  # of a folder that another process has removed: what has that name by now is another one
+        # of a folder that another process has removed: what has that name by now is another one
+        os.close(handle)
 
 
 def _begin(workspace, run, resume, open_keys):
@@ -222,7 +233,8 @@ def _begin(workspace, run, resume, open_keys):
             leftover.unlink()
     elif not resume:
         raise SettingsError(
-            f"'{workspace.folder}' holds an unfinished run: continue it with resume (--resume), or delete the folder"
+            f"'{workspace.folder}' holds an unfinished run: continue it with resume (--resume), or"
+            " delete the folder"
         )
     else:
         _check_same(workspace.folder, unfinished, run, open_keys)
@@ -234,7 +246,10 @@ def _recorded(folder):
     names = [path.name for path in folder.iterdir()]
     foreign = [name for name in names if name != _RUN and not name.endswith(_OURS)]
     if foreign:
-        raise SettingsError(f"'{folder}', for what a run can continue from, holds other files ('{foreign[0]}'): move them away")
+        raise SettingsError(
+            f"'{folder}', for what a run can continue from, holds other files ('{foreign[0]}'):"
+            " move them away"
+        )
     if _RUN not in names:
         return None
     try:
@@ -243,7 +258,10 @@ def _recorded(folder):
             return run
     except ValueError:
         pass
-    raise SettingsError(f"'{folder / _RUN}' is damaged, so what it belongs to cannot be told: delete the folder to start anew")
+    raise SettingsError(
+        f"'{folder / _RUN}' is damaged, so what it belongs to cannot be told: delete the folder to"
+        " start anew"
+    )
 
 
 def _check_same(folder, unfinished, run, open_keys):
@@ -256,7 +274,8 @@ def _check_same(folder, unfinished, run, open_keys):
     ]
     if changed:
         raise SettingsError(
-            f"the unfinished run in '{folder}' cannot be continued: {'; '.join(changed)}; restore that, or delete the folder"
+            f"the unfinished run in '{folder}' cannot be continued: {'; '.join(changed)}; restore"
+            " that, or delete the folder"
         )
 
 
@@ -298,4 +317,6 @@ def _typed(path):
     try:
         yield
     except OSError as error:
-        raise SettingsError(f"'{path}', for what a run can continue from, cannot be used: {error.strerror or error}") from None
+        raise SettingsError(
+            f"'{path}', for what a run can continue from, cannot be used: {error.strerror or error}"
+        ) from None

@@ -13,15 +13,17 @@ from ..system.runtime import pyrender as load_pyrender
 from ..system.runtime import raster_install_command, raster_platform
 
 pyrender = load_pyrender()  # chooses the OpenGL platform, before OpenGL is imported
-from OpenGL import GL  # noqa: E402
-from pyrender.renderer import Renderer  # noqa: E402
-from pyrender.shader_program import ShaderProgramCache  # noqa: E402
+from OpenGL import GL
+from pyrender.renderer import Renderer
+from pyrender.shader_program import ShaderProgramCache
 
 SHADERS = Path(__file__).parent / "shaders"
 
 
 class _Canvas(Renderer):
-    """pyrender's renderer with the shaders of this program and one float32 image, (h, w, 4), without multisampling."""
+    """pyrender's renderer with the shaders of this program and one float32 image, (h, w, 4),
+    without multisampling.
+    """
 
     def __init__(self, width, height):
         super().__init__(width, height)
@@ -41,7 +43,9 @@ class _Canvas(Renderer):
 
     def _attach(self, buffer, pixels, place):
         GL.glBindRenderbuffer(GL.GL_RENDERBUFFER, buffer)
-        GL.glRenderbufferStorage(GL.GL_RENDERBUFFER, pixels, self.viewport_width, self.viewport_height)
+        GL.glRenderbufferStorage(
+            GL.GL_RENDERBUFFER, pixels, self.viewport_width, self.viewport_height
+        )
         GL.glFramebufferRenderbuffer(GL.GL_FRAMEBUFFER, place, GL.GL_RENDERBUFFER, buffer)
 
     def _delete_main_framebuffer(self):
@@ -53,7 +57,9 @@ class _Canvas(Renderer):
     def _read_main_framebuffer(self, scene, flags):
         width, height = self.viewport_width, self.viewport_height
         GL.glBindFramebuffer(GL.GL_READ_FRAMEBUFFER, self._main_fb_ms)
-        return GL.glReadPixels(0, 0, width, height, GL.GL_RGBA, GL.GL_FLOAT).reshape(height, width, 4)[::-1]
+        return GL.glReadPixels(0, 0, width, height, GL.GL_RGBA, GL.GL_FLOAT).reshape(
+            height, width, 4
+        )[::-1]
 
 
 class _Camera(pyrender.Camera):
@@ -71,14 +77,26 @@ class _Albedo(pyrender.Texture):
     def __init__(self, texels):
         clamp = pyrender.GLTF.CLAMP_TO_EDGE
         sampler = pyrender.Sampler(None, GL.GL_LINEAR, GL.GL_LINEAR_MIPMAP_LINEAR, clamp, clamp)
-        super().__init__(sampler=sampler, source_channels="RGB", width=texels.shape[1], height=texels.shape[0])
+        super().__init__(
+            sampler=sampler, source_channels="RGB", width=texels.shape[1], height=texels.shape[0]
+        )
         self._texels = texels
 
     def _add_to_context(self):
         super()._add_to_context()
         self._bind()
         texels = self._texels.astype(np.float32)
-        GL.glTexImage2D(GL.GL_TEXTURE_2D, 0, GL.GL_RGB16F, self.width, self.height, 0, GL.GL_RGB, GL.GL_FLOAT, texels)
+        GL.glTexImage2D(
+            GL.GL_TEXTURE_2D,
+            0,
+            GL.GL_RGB16F,
+            self.width,
+            self.height,
+            0,
+            GL.GL_RGB,
+            GL.GL_FLOAT,
+            texels,
+        )
         GL.glGenerateMipmap(GL.GL_TEXTURE_2D)
         self._unbind()
 
@@ -138,15 +156,22 @@ def open_canvas(width, height):
 
 
 def check_size(width, height):
-    """Raise SettingsError if an image of a size in samples is above OpenGL's limit; what it raises else, see `open_canvas`."""
+    """Raise SettingsError if an image of a size in samples is above OpenGL's limit; what it raises
+    else, see `open_canvas`.
+    """
     make_current()
-    limit = min(GL.glGetIntegerv(GL.GL_MAX_RENDERBUFFER_SIZE), GL.glGetIntegerv(GL.GL_MAX_TEXTURE_SIZE))
+    limit = min(
+        GL.glGetIntegerv(GL.GL_MAX_RENDERBUFFER_SIZE), GL.glGetIntegerv(GL.GL_MAX_TEXTURE_SIZE)
+    )
     if max(width, height) > limit:
         raise SettingsError(
-            f"a raster image of {width}x{height} samples is above OpenGL's limit of {limit} a side: make it smaller"
+            f"a raster image of {width}x{height} samples is above OpenGL's limit of {limit} a side:"
+            " make it smaller"
         )
 
 
 def draw(canvas, drawn):
-    """The canvas (h, w, 4) float32 after drawing a pyrender scene: see the shaders for what the channels hold."""
+    """The canvas (h, w, 4) float32 after drawing a pyrender scene: see the shaders for what the
+    channels hold.
+    """
     return canvas.render(drawn, pyrender.RenderFlags.OFFSCREEN)

@@ -1,9 +1,10 @@
 """Direct light at pixels, by shadow rays."""
 
-from ..system.runtime import mitsuba
 from ..scene.materials import facing
+from ..system.runtime import mitsuba
 
-SHADOW_END = 1e-3  # share of the way to a light at which its shadow ray ends: lights lie on surfaces
+# share of the way to a light at which its shadow ray ends: lights lie on surfaces
+SHADOW_END = 1e-3
 
 
 def direct_irradiance(scene, places, si, ray, active):
@@ -34,4 +35,6 @@ def direct_irradiance(scene, places, si, ray, active):
         value = intensity * (cosine / dr.square(distance))
         return number + 1, total + dr.select(lit & dr.all(dr.isfinite(value)), value, 0)
 
-    return dr.while_loop((dr.opaque(mi.UInt32, 0), mi.Color3f(0)), lambda number, _: number < places.count, add)[1]
+    return dr.while_loop(
+        (dr.opaque(mi.UInt32, 0), mi.Color3f(0)), lambda number, _: number < places.count, add
+    )[1]

@@ -33,7 +33,9 @@ def render_image(asset, mi_scene, sensor, spp=64, seed=0, irradiance=None, pixel
         Linear radiance.
     """
     integrator = integrator_for(asset, irradiance, pixel_light)
-    return np.array(mitsuba().render(mi_scene, sensor=sensor, integrator=integrator, spp=spp, seed=seed))[..., :3]
+    return np.array(
+        mitsuba().render(mi_scene, sensor=sensor, integrator=integrator, spp=spp, seed=seed)
+    )[..., :3]
 
 
 def pick_sensor(mi_scene, index):
@@ -46,9 +48,14 @@ def pick_sensor(mi_scene, index):
     """
     sensors = mi_scene.sensors()
     if not sensors:
-        raise SettingsError("the scene has no sensor: add one to it, or ask for .ply or .npz output, which needs none")
+        raise SettingsError(
+            "the scene has no sensor: add one to it, or ask for .ply or .npz output, which needs"
+            " none"
+        )
     if not 0 <= index < len(sensors):
-        raise SettingsError(f"sensor {index} does not exist: the scene has sensors 0…{len(sensors) - 1}")
+        raise SettingsError(
+            f"sensor {index} does not exist: the scene has sensors 0…{len(sensors) - 1}"
+        )
     return sensors[index]
 
 
@@ -66,9 +73,13 @@ def resized(sensor, size):
         return
     width, height = size
     if min(width, height) < 1 or width * height > MAX_PIXELS:
-        raise SettingsError(f"image size {width}x{height} must be at least 1x1 and at most {MAX_PIXELS:,} pixels")
+        raise SettingsError(
+            f"image size {width}x{height} must be at least 1x1 and at most {MAX_PIXELS:,} pixels"
+        )
     parameters = mitsuba().traverse(sensor)
-    before = {key: list(parameters[key]) for key in ("film.size", "film.crop_size", "film.crop_offset")}
+    before = {
+        key: list(parameters[key]) for key in ("film.size", "film.crop_size", "film.crop_offset")
+    }
     parameters["film.size"] = parameters["film.crop_size"] = [width, height]
     parameters["film.crop_offset"] = [0, 0]
     parameters.update()
@@ -81,7 +92,9 @@ def resized(sensor, size):
 
 
 def coverage(mi_scene, sensor, spp, seed=0):
-    """Share of each pixel that geometry covers, (h, w) float32: 1 inside silhouettes, 0 on the background."""
+    """Share of each pixel that geometry covers, (h, w) float32: 1 inside silhouettes, 0 on the
+    background.
+    """
     mi = mitsuba()
 
     class Coverage(mi.SamplingIntegrator):
@@ -89,4 +102,6 @@ def coverage(mi_scene, sensor, spp, seed=0):
             hit = scene.ray_intersect_preliminary(ray, coherent=True, active=active).is_valid()
             return mi.Color3f(mi.Float(hit)), active, []
 
-    return np.array(mi.render(mi_scene, sensor=sensor, integrator=Coverage(mi.Properties()), spp=spp, seed=seed))[..., 0]
+    return np.array(
+        mi.render(mi_scene, sensor=sensor, integrator=Coverage(mi.Properties()), spp=spp, seed=seed)
+    )[..., 0]

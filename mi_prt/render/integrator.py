@@ -4,28 +4,32 @@ from functools import cache
 
 import numpy as np
 
+from ..asset.meshless_asset import MeshlessAsset
 from ..asset.opening import load
 from ..errors import InputError, SettingsError
 from ..lighting.emission import emission_of
 from ..lighting.local_emitters import local_scene_light
 from ..lighting.places import Places
 from ..lighting.scene_light import scene_light
-from ..asset.meshless_asset import MeshlessAsset
-from ..system.runtime import VARIANTS, mitsuba
 from ..scene.materials import reflectance_at
 from ..scene.scene import Scene, SceneSource
 from ..scene.traversal import digest_of
+from ..system.runtime import VARIANTS, mitsuba
 from .direct_light import direct_irradiance
 
 DIRECT = ("points", "pixels")
 
 
 def register_integrator():
-    """Register the plugin `prt` in the variants of `runtime.VARIANTS`, now and whenever one is set."""
+    """Register the plugin `prt` in the variants of `runtime.VARIANTS`, now and whenever one is
+    set.
+    """
     try:
         import mitsuba as mi
     except (ImportError, NameError):
-        return  # a broken installation: `mi-prt doctor` must still start, and everything else raises a typed error
+        # a broken installation: `mi-prt doctor` must still start, and everything else raises a
+        # typed error
+        return
 
     mi.detail.add_variant_callback(lambda old, new: _register(new))
     if mi.variant() is not None:
@@ -48,9 +52,10 @@ def _plugin_class(variant):
     class PRTIntegrator(mi.SamplingIntegrator):
         """Precomputed radiance transfer (`prt`).
 
-        Shows a scene under its emitters with the transport of an asset: its distant emitters, or its local ones if the asset is one of
-        local lights. The irradiance at the asset's points is interpolated at each hit and multiplied by the albedo there, so textures
-        keep their own resolution; emitters and the background are shown as Mitsuba's own integrators show them.
+        Shows a scene under its emitters with the transport of an asset: its distant emitters, or
+        its local ones if the asset is one of local lights. The irradiance at the asset's points is
+        interpolated at each hit and multiplied by the albedo there, so textures keep their own
+        resolution; emitters and the background are shown as Mitsuba's own integrators show them.
 
         Parameters (plugin)
         -------------------
@@ -58,7 +63,8 @@ def _plugin_class(variant):
             The asset; relative paths are resolved as Mitsuba resolves them (next to the XML file).
         hide_emitters : bool, default false
         direct : string, default "points"
-            With an asset of local lights, where direct light is computed: at its "points", or with shadow rays at the "pixels".
+            With an asset of local lights, where direct light is computed: at its "points", or with
+            shadow rays at the "pixels".
 
         Raises
         ------
@@ -77,7 +83,9 @@ def _plugin_class(variant):
             self.asset = asset or _load(str(properties["filename"]))
             self._direct = str(properties.get("direct", "points"))
             if self._direct not in DIRECT:
-                raise SettingsError(f"direct '{self._direct}' is not known: use {' or '.join(DIRECT)}")
+                raise SettingsError(
+                    f"direct '{self._direct}' is not known: use {' or '.join(DIRECT)}"
+                )
             self._follows_emitters = irradiance is None
             self._irradiance = None if irradiance is None else mi.Float(irradiance.ravel())
             self._places = None if pixel_light is None else Places(pixel_light)
@@ -97,7 +105,9 @@ def _plugin_class(variant):
             if not self._follows_emitters:
                 return
             local = isinstance(self.asset, MeshlessAsset)
-            light = digest_of(self._wrapped.local_emitters if local else self._wrapped.distant_emitters)
+            light = digest_of(
+                self._wrapped.local_emitters if local else self._wrapped.distant_emitters
+            )
             if self._light != light:
                 self._irradiance = mi.Float(self._under(self._wrapped, local).ravel())
                 self._light = light
@@ -135,8 +145,8 @@ def _plugin_class(variant):
         def _first_hit(self, scene, ray, active):
             """The first intersection; with hide_emitters the first that is no area light.
 
-            Mitsuba's own `skip_area_emitters` measures distances from the last light it passed, which puts hits on
-            analytic shapes elsewhere.
+            Mitsuba's own `skip_area_emitters` measures distances from the last light it passed,
+            which puts hits on analytic shapes elsewhere.
             """
 
             def trace(ray, active):
@@ -153,7 +163,9 @@ def _plugin_class(variant):
                 behind, surface, another = trace(ray, lamp)
                 return ray, dr.select(lamp, behind, pi), dr.select(lamp, surface, si), another
 
-            _, pi, si, _ = dr.while_loop((ray, pi, si, lamp), lambda ray, pi, si, lamp: lamp, pass_through)
+            _, pi, si, _ = dr.while_loop(
+                (ray, pi, si, lamp), lambda ray, pi, si, lamp: lamp, pass_through
+            )
             return pi, si
 
         def to_string(self):
@@ -186,7 +198,9 @@ def integrator_for(asset, irradiance=None, pixel_light=None):
     if irradiance is not None:
         irradiance = np.asarray(irradiance, dtype=np.float32)
         if irradiance.shape != (len(asset.points), 3):
-            raise SettingsError(f"irradiance must be of shape ({len(asset.points)}, 3), got {irradiance.shape}")
+            raise SettingsError(
+                f"irradiance must be of shape ({len(asset.points)}, 3), got {irradiance.shape}"
+            )
     return _plugin_class(mi.variant())(mi.Properties("prt"), asset, irradiance, pixel_light)
 
 

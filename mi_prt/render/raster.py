@@ -1,11 +1,14 @@
-"""Raster images of an asset by pyrender: the triangles between its points, without tracing a ray at them.
+"""Raster images of an asset by pyrender: the triangles between its points, without tracing a ray at
+them.
 
-They show what the integrator `prt` shows: irradiance interpolated between points times albedo, and what is seen of the
-emitters. Differences remain at outlines (curved shapes are the polygons between their points), at edges within textures
-(a pixel has few samples), and where a texture is larger than 4096 texels over a surface.
+They show what the integrator `prt` shows: irradiance interpolated between points times albedo, and
+what is seen of the emitters. Differences remain at outlines (curved shapes are the polygons between
+their points), at edges within textures (a pixel has few samples), and where a texture is larger
+than 4096 texels over a surface.
 
-The program's own shaders draw linear radiance into a float32 image. pyrender's framebuffer would round each sample to 8
-bits and mix the colour of its background into outlines before the real background is known.
+The program's own shaders draw linear radiance into a float32 image. pyrender's framebuffer would
+round each sample to 8 bits and mix the colour of its background into outlines before the real
+background is known.
 
 Importing this module opens OpenGL.
 """
@@ -24,7 +27,8 @@ from .view import view_of
 
 MIN_TEXELS, MAX_TEXELS = 512, 4096  # along a side of a baked texture
 PROCEDURAL_TEXELS = 256  # along a period of a texture that is no bitmap
-BURIED_WEIGHT = 1e-5  # of buried points in interpolation: nothing beside others, all where there are no others
+# of buried points in interpolation: nothing beside others, all where there are no others
+BURIED_WEIGHT = 1e-5
 
 
 def render_raster(asset, scene, irradiance, sensor, factor, samples=2):
@@ -52,10 +56,11 @@ def render_raster(asset, scene, irradiance, sensor, factor, samples=2):
 
 
 class RasterScene:
-    """A scene as one sensor sees it, to be drawn under changing light; a context manager, see `close`.
+    """A scene as one sensor sees it, to be drawn under changing light; a context manager, see
+    `close`.
 
-    Each pixel is the mean of its samples' linear radiance, as in Mitsuba with a box filter, whatever the film's own
-    filter is.
+    Each pixel is the mean of its samples' linear radiance, as in Mitsuba with a box filter,
+    whatever the film's own filter is.
 
     Parameters
     ----------
@@ -63,7 +68,8 @@ class RasterScene:
     scene : Scene
         That of the asset. Its environment is the background, its area lights are seen.
     sensor : mi.Sensor
-        perspective, orthographic, or thinlens (drawn without its blur). The film's crop window is respected.
+        perspective, orthographic, or thinlens (drawn without its blur). The film's crop window is
+        respected.
     samples : int
         Along each side of a pixel: 2 for four in all.
 
@@ -77,8 +83,8 @@ class RasterScene:
         If OpenGL cannot be opened.
 
     Notes
-    -----
-    Radiance of area lights is interpolated between their points. Shapes that have no points are not drawn.
+    ----- Radiance of area lights is interpolated between their points. Shapes that have no points
+    are not drawn.
     """
 
     def __init__(self, asset, scene, sensor, samples=2):
@@ -115,8 +121,12 @@ class RasterScene:
         (h, w, 3) float32
         """
         if np.shape(irradiance) != self._emission.shape:
-            raise SettingsError(f"irradiance must be of shape {self._emission.shape}, got {np.shape(irradiance)}")
-        light = np.hstack([self._weight * (self._reflection * irradiance + self._emission), self._weight])
+            raise SettingsError(
+                f"irradiance must be of shape {self._emission.shape}, got {np.shape(irradiance)}"
+            )
+        light = np.hstack(
+            [self._weight * (self._reflection * irradiance + self._emission), self._weight]
+        )
         make_current()
         for part, primitive in zip(self._parts, self._primitives):
             primitive.color_0 = light[part.points]
@@ -140,7 +150,9 @@ class RasterScene:
         self.close()
 
     def _add_background(self, drawn, environment):
-        """Fill the samples (h, w, 4) that no triangle covers with the radiance of an emitter, or leave them black."""
+        """Fill the samples (h, w, 4) that no triangle covers with the radiance of an emitter, or
+        leave them black.
+        """
         import drjit as dr
 
         uncovered = drawn[..., 3] == 0
@@ -155,7 +167,7 @@ class RasterScene:
         drawn[uncovered, :3] = _rgb(environment.eval(self._sky), uncovered.sum())
 
 
-# --- triangles and what they reflect -------------------------------------------------------------------------------
+# --- triangles and what they reflect --------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,14 +194,21 @@ class _Part:
 
 def _check_surfaces(scene, points):
     if [s.kind for s in scene.surfaces] != [s["kind"] for s in points.surfaces]:
-        raise SceneError("the scene's shapes are not those of the asset: pass the scene that it was precomputed from")
+        raise SceneError(
+            "the scene's shapes are not those of the asset: pass the scene that it was precomputed"
+            " from"
+        )
     bare = [s["name"] for s in points.surfaces if not s["patches"]]
     if bare:
-        warnings.warn(f"the raster renderer leaves out shapes without points: {', '.join(bare)}", stacklevel=3)
+        warnings.warn(
+            f"the raster renderer leaves out shapes without points: {', '.join(bare)}", stacklevel=3
+        )
 
 
 def _parts(scene, points):
-    """The triangles of both sides: one part for each side of a textured surface, one for all other surfaces."""
+    """The triangles of both sides: one part for each side of a textured surface, one for all other
+    surfaces.
+    """
     backs = _backs(points)
     fronts = points.patches.triangles()
     surface = points.surface[fronts[:, 0]]
@@ -197,24 +216,39 @@ def _parts(scene, points):
     plain = fronts[~textured[surface]]
     back = backs[points.surface[plain[:, 0]], None]
     plain = np.concatenate([plain, (plain + back)[back[:, 0] > 0]])
-    parts = [_Part(np.arange(len(points)), np.zeros_like(points.uv), plain, None)] if len(plain) else []
+    parts = (
+        [_Part(np.arange(len(points)), np.zeros_like(points.uv), plain, None)] if len(plain) else []
+    )
     for i in np.unique(surface[textured[surface]]):
         vertices, uv, triangles = _textured_triangles(points, i, fronts[surface == i])
         low, high = uv.min(axis=0), uv.max(axis=0)
         extent = np.maximum(high - low, 1e-6)
         for side in (1, -1) if backs[i] else (1,):
             texture = _bake(scene.surfaces[i], side, low, extent)
-            parts.append(_Part(vertices + (backs[i] if side < 0 else 0), (uv - low) / extent, triangles, texture))
+            parts.append(
+                _Part(
+                    vertices + (backs[i] if side < 0 else 0),
+                    (uv - low) / extent,
+                    triangles,
+                    texture,
+                )
+            )
     return parts
 
 
 def _backs(points):
-    """What takes a point of each surface to the point behind it, (surfaces,) int; 0 where the back does not reflect."""
-    return np.array([points.patches.back[s["first_patch"]] if s["patches"] else 0 for s in points.surfaces])
+    """What takes a point of each surface to the point behind it, (surfaces,) int; 0 where the back
+    does not reflect.
+    """
+    return np.array(
+        [points.patches.back[s["first_patch"]] if s["patches"] else 0 for s in points.surfaces]
+    )
 
 
 def _textured_triangles(points, index, fronts):
-    """Vertices (v,) as points, their uv (v, 2), and triangles (m, 3) of vertices, of a surface's front."""
+    """Vertices (v,) as points, their uv (v, 2), and triangles (m, 3) of vertices, of a surface's
+    front.
+    """
     if points.surfaces[index]["kind"] == "mesh":
         vertices, triangles = np.unique(fronts, return_inverse=True)
         return vertices, points.uv[vertices], triangles.reshape(-1, 3)
@@ -227,13 +261,15 @@ def _textured_triangles(points, index, fronts):
 
 
 def _shading(scene, points):
-    """What takes irradiance E at the points to a light r·E + e that, times albedo a, is their radiance.
+    """What takes irradiance E at the points to a light r·E + e that, times albedo a, is their
+    radiance.
 
     Returns
     -------
     reflection, emission : (n, 3) float32
     albedo : (n, 4) float32
-        The fourth is 1 where the other side of the surface has points too, plus 2 on analytic shapes.
+        The fourth is 1 where the other side of the surface has points too, plus 2 on analytic
+        shapes.
     """
     reflection = np.full((len(points), 3), 1 / np.pi, np.float32)
     emission = np.zeros((len(points), 3), np.float32)
@@ -256,7 +292,10 @@ def _emitted(surface, uv):
 
 
 def _is_baked(surface):
-    """Whether a surface has textures over uv. For attributes of meshes, and on lights, the points' albedo must do."""
+    """Whether a surface has textures over uv.
+
+    For attributes of meshes, and on lights, the points' albedo must do.
+    """
     modelled = surface.material.modelled
     has_map = any(key.endswith("to_uv") for key in mitsuba().traverse(modelled).keys())
     return has_map and "MeshAttribute" not in str(modelled) and surface.shape.emitter() is None
@@ -274,16 +313,22 @@ def _bake(surface, side, low, extent):
 def _texels(bsdf, extent):
     """Texels (width, height) that show a material's bitmaps over an extent (2,) of uv.
 
-    Those of the bitmap itself, so that nothing is resampled; a multiple of them where they are few, so that it does not
-    matter if the bitmap is turned against uv.
+    Those of the bitmap itself, so that nothing is resampled; a multiple of them where they are few,
+    so that it does not matter if the bitmap is turned against uv.
     """
     parameters = mitsuba().traverse(bsdf)
     wanted = [(1, 1)]
     for key in parameters.keys():
         if key.endswith("to_uv"):
             data = key.removesuffix("to_uv") + "data"
-            shape = parameters[data].shape[1::-1] if data in parameters else (PROCEDURAL_TEXELS, PROCEDURAL_TEXELS)
-            to_texels = np.array(parameters[key].matrix, dtype=np.float64)[:2, :2] * np.reshape(shape, (2, 1))
+            shape = (
+                parameters[data].shape[1::-1]
+                if data in parameters
+                else (PROCEDURAL_TEXELS, PROCEDURAL_TEXELS)
+            )
+            to_texels = np.array(parameters[key].matrix, dtype=np.float64)[:2, :2] * np.reshape(
+                shape, (2, 1)
+            )
             wanted.append(np.linalg.norm(to_texels, axis=0) * extent)
     texels = np.max(wanted, axis=0)
     return np.minimum(np.rint(texels * np.ceil(MIN_TEXELS / texels)), MAX_TEXELS).astype(int)

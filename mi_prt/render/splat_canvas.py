@@ -9,7 +9,8 @@ from .canvas import GL, SHADERS, ShaderProgramCache, make_current
 
 
 class SplatCanvas:
-    """A float32 image, (h, w, 3), of splats on a surface that is known at each sample: see the shaders.
+    """A float32 image, (h, w, 3), of splats on a surface that is known at each sample: see the
+    shaders.
 
     Parameters
     ----------
@@ -32,15 +33,21 @@ class SplatCanvas:
         make_current()
         self._size, self._samples, self._count = view.size, samples, len(splats)
         cache = ShaderProgramCache(str(SHADERS))
-        self._splat = _program(cache, "splat", constants, P=view.to_clip, eye=view.eye, axis=view.axis, surface=0)
+        self._splat = _program(
+            cache, "splat", constants, P=view.to_clip, eye=view.eye, axis=view.axis, surface=0
+        )
         self._mean = _program(cache, "splat_mean", {}, weighted=0, reflected=1, samples=samples)
         width, height = (samples * side for side in self._size)
         self._surface = _texture(GL.GL_RGBA32F, width, height, GL.GL_RGBA, surface)
         self._reflected = _texture(GL.GL_RGB32F, width, height, GL.GL_RGB, reflected)
-        self._depth = _texture(GL.GL_DEPTH_COMPONENT32F, width, height, GL.GL_DEPTH_COMPONENT, depth)
+        self._depth = _texture(
+            GL.GL_DEPTH_COMPONENT32F, width, height, GL.GL_DEPTH_COMPONENT, depth
+        )
         self._weighted = _texture(GL.GL_RGBA32F, width, height, GL.GL_RGBA)
         self._radiance = _texture(GL.GL_RGBA32F, *self._size, GL.GL_RGBA)
-        self._sums = _framebuffer({GL.GL_COLOR_ATTACHMENT0: self._weighted, GL.GL_DEPTH_ATTACHMENT: self._depth})
+        self._sums = _framebuffer(
+            {GL.GL_COLOR_ATTACHMENT0: self._weighted, GL.GL_DEPTH_ATTACHMENT: self._depth}
+        )
         self._image = _framebuffer({GL.GL_COLOR_ATTACHMENT0: self._radiance})
         self._vertices, (self._buffer, self._light) = GL.glGenVertexArrays(1), GL.glGenBuffers(2)
         GL.glBindVertexArray(self._vertices)
@@ -78,7 +85,9 @@ class SplatCanvas:
         self._mean._bind()
         GL.glDrawArrays(GL.GL_TRIANGLES, 0, 3)
         GL.glBindVertexArray(0)
-        return GL.glReadPixels(0, 0, width, height, GL.GL_RGB, GL.GL_FLOAT).reshape(height, width, 3)[::-1]
+        return GL.glReadPixels(0, 0, width, height, GL.GL_RGB, GL.GL_FLOAT).reshape(
+            height, width, 3
+        )[::-1]
 
     def delete(self):
         """Free what OpenGL holds."""
@@ -86,7 +95,9 @@ class SplatCanvas:
         self._splat.delete()
         self._mean.delete()
         GL.glDeleteFramebuffers(2, [self._sums, self._image])
-        GL.glDeleteTextures([self._surface, self._reflected, self._depth, self._weighted, self._radiance])
+        GL.glDeleteTextures(
+            [self._surface, self._reflected, self._depth, self._weighted, self._radiance]
+        )
         GL.glDeleteVertexArrays(1, [self._vertices])
         GL.glDeleteBuffers(2, [self._buffer, self._light])
 
@@ -101,7 +112,9 @@ def _program(cache, name, constants, **uniforms):
 
 
 def _texture(kind, width, height, channels, texels=None):
-    """A texture that is read by `texelFetch`; texels (h, w, …) float32 are given from the upper row down."""
+    """A texture that is read by `texelFetch`; texels (h, w, …) float32 are given from the upper row
+    down.
+    """
     texture = GL.glGenTextures(1)
     GL.glBindTexture(GL.GL_TEXTURE_2D, texture)
     GL.glTexParameteri(GL.GL_TEXTURE_2D, GL.GL_TEXTURE_MIN_FILTER, GL.GL_NEAREST)
@@ -112,7 +125,8 @@ def _texture(kind, width, height, channels, texels=None):
 
 
 def _bind_textures(*textures):
-    for unit, texture in reversed(list(enumerate(textures))):  # unit 0 stays the active one, as pyrender has it
+    # unit 0 stays the active one, as pyrender has it
+    for unit, texture in reversed(list(enumerate(textures))):
         GL.glActiveTexture(GL.GL_TEXTURE0 + unit)
         GL.glBindTexture(GL.GL_TEXTURE_2D, texture)
 
@@ -126,12 +140,16 @@ def _framebuffer(textures):
 
 
 def _attributes(buffer, values, widths):
-    """Let columns of values (m, k) float32 be attributes of each instance: {location: how many columns}."""
+    """Let columns of values (m, k) float32 be attributes of each instance: {location: how many
+    columns}.
+    """
     GL.glBindBuffer(GL.GL_ARRAY_BUFFER, buffer)
     GL.glBufferData(GL.GL_ARRAY_BUFFER, values.nbytes, values, GL.GL_STATIC_DRAW)
     first = 0
     for location, width in widths.items():
         GL.glEnableVertexAttribArray(location)
-        GL.glVertexAttribPointer(location, width, GL.GL_FLOAT, GL.GL_FALSE, values.strides[0], GL.GLvoidp(first))
+        GL.glVertexAttribPointer(
+            location, width, GL.GL_FLOAT, GL.GL_FALSE, values.strides[0], GL.GLvoidp(first)
+        )
         GL.glVertexAttribDivisor(location, 1)
         first += width * values.itemsize

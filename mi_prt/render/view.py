@@ -6,15 +6,20 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..errors import SettingsError
-from ..system.runtime import mitsuba
 from ..scene.traversal import transform_of
+from ..system.runtime import mitsuba
 
-SENSORS = {"PerspectiveCamera": "perspective", "ThinLensCamera": "thinlens", "OrthographicCamera": "orthographic"}
+SENSORS = {
+    "PerspectiveCamera": "perspective",
+    "ThinLensCamera": "thinlens",
+    "OrthographicCamera": "orthographic",
+}
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """Where a sensor puts the world. Positions in the image go from (0, 0), upper left, to (1, 1), lower right.
+    """Where a sensor puts the world. Positions in the image go from (0, 0), upper left, to (1, 1),
+    lower right.
 
     Parameters
     ----------
@@ -24,7 +29,8 @@ class View:
     eye : (4,)
         Position of the viewer; for parallel rays the direction to it, with w = 0.
     axis : (4,)
-        Dot product with a position (x, y, z, 1): how far it is in front of the viewer, along the axis.
+        Dot product with a position (x, y, z, 1): how far it is in front of the viewer, along the
+        axis.
     near, far : float
         What is seen lies between these distances along the axis.
     """
@@ -42,7 +48,9 @@ class View:
         return np.vstack([self.image, *self._z_and_w(self.axis, np.array([0, 0, 0, 1]))])
 
     def window_depth(self, distance):
-        """What OpenGL compares, 0 at the near plane and 1 at the far one, of some distances along the axis."""
+        """What OpenGL compares, 0 at the near plane and 1 at the far one, of some distances along
+        the axis.
+        """
         z, w = self._z_and_w(distance, 1)
         return (1 + z / w) / 2
 
@@ -62,7 +70,9 @@ class View:
         """Unit directions (k, 3) of rays through positions x, y (k,) in the image."""
         ones = np.ones_like(x)
         far = np.linalg.solve(self.to_clip, [2 * x - ones, ones - 2 * y, ones, ones])
-        directions = (far[:3] / far[3] - self.eye[:3, None] if self.eye[3] else -self.eye[:3, None] * ones).T
+        directions = (
+            far[:3] / far[3] - self.eye[:3, None] if self.eye[3] else -self.eye[:3, None] * ones
+        ).T
         return directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
@@ -76,15 +86,23 @@ def view_of(sensor):
     """
     kind = sensor.class_name()
     if kind not in SENSORS:
-        raise SettingsError(f"the raster renderer draws {', '.join(SENSORS.values())} sensors, not {kind}: use mitsuba")
+        raise SettingsError(
+            f"the raster renderer draws {', '.join(SENSORS.values())} sensors, not {kind}: use"
+            " mitsuba"
+        )
     if kind == "ThinLensCamera":
-        warnings.warn("the raster renderer draws a thinlens sensor as a pinhole, all in focus", stacklevel=3)
+        warnings.warn(
+            "the raster renderer draws a thinlens sensor as a pinhole, all in focus", stacklevel=3
+        )
     to_world = transform_of(sensor)
     to_camera = np.linalg.inv(to_world)
     corners = rays(sensor, [0, 1], [0, 1])
-    # In Mitsuba's camera space, x to the left, y up, and z forward. Clip space is x to the right, -1 to 1 times w.
+    # In Mitsuba's camera space, x to the left, y up, and z forward. Clip space is x to the right,
+    # -1 to 1 times w.
     if kind == "OrthographicCamera":
-        (x0, x1), (y0, y1), _ = to_camera[:3, :3] @ np.array(corners.o, np.float64) + to_camera[:3, 3:]
+        (x0, x1), (y0, y1), _ = (
+            to_camera[:3, :3] @ np.array(corners.o, np.float64) + to_camera[:3, 3:]
+        )
         eye, centre = -to_world[:, 2], 3
     else:
         x, y, z = to_camera[:3, :3] @ np.array(corners.d, np.float64)

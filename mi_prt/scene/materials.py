@@ -1,4 +1,7 @@
-"""What of a material the transport models: its diffuse reflection. The rest is named, not dropped in silence."""
+"""What of a material the transport models: its diffuse reflection.
+
+The rest is named, not dropped in silence.
+"""
 
 from dataclasses import dataclass
 
@@ -50,7 +53,9 @@ class Material:
     left_out: tuple
 
     def left_out_albedo(self, samples=4096, seed=0):
-        """Share of light at 45° that the material scatters in ways that are left out, averaged over uv, 0…1."""
+        """Share of light at 45° that the material scatters in ways that are left out, averaged over
+        uv, 0…1.
+        """
         if not self.left_out:
             return 0.0
         import drjit as dr
@@ -77,13 +82,17 @@ def model_material(bsdf):
     left_out = []
     modelled = _model(bsdf, left_out)
     two_sided = mi.has_flag(modelled.flags(), mi.BSDFFlags.BackSide)
-    textured = any(key.endswith((".data", "color0.value")) or "vertex_" in key for key in mi.traverse(modelled).keys())
+    textured = any(
+        key.endswith((".data", "color0.value")) or "vertex_" in key
+        for key in mi.traverse(modelled).keys()
+    )
     textured = textured or mi.has_flag(modelled.flags(), mi.BSDFFlags.SpatiallyVarying)
     return Material(bsdf, modelled, two_sided, textured, tuple(dict.fromkeys(left_out)))
 
 
 def reflectance_at(si, surfaces, active=True):
-    """Diffuse reflectance (mi.Color3f) at hits, from the modelled material of each surface; 0 where a texture holds NaN or infinity.
+    """Diffuse reflectance (mi.Color3f) at hits, from the modelled material of each surface; 0 where
+    a texture holds NaN or infinity.
 
     Parameters
     ----------
@@ -94,7 +103,9 @@ def reflectance_at(si, surfaces, active=True):
     """
     import drjit as dr
 
-    reflectance = mitsuba().Color3f(modelled_bsdf(si, surfaces).eval_diffuse_reflectance(si, active))
+    reflectance = mitsuba().Color3f(
+        modelled_bsdf(si, surfaces).eval_diffuse_reflectance(si, active)
+    )
     return dr.select(dr.isfinite(reflectance), reflectance, 0)
 
 
@@ -125,8 +136,8 @@ class Facing:
 def facing(si, ray, surfaces):
     """The side of surfaces that rays meet, told by the faces and not by smooth normals.
 
-    A smooth normal can turn away from a ray that comes from the outer side of the face. Mitsuba's own materials are black there, which
-    loses energy; here such a hit reflects.
+    A smooth normal can turn away from a ray that comes from the outer side of the face. Mitsuba's
+    own materials are black there, which loses energy; here such a hit reflects.
 
     Parameters
     ----------
@@ -169,9 +180,13 @@ def _model(bsdf, left_out):
             # What has a back already (glass, a nested twosided) needs no second one.
             if any(mi.has_flag(m.flags(), mi.BSDFFlags.BackSide) for m in modelled):
                 return modelled[0]
-            return mi.load_dict({"type": "twosided", **{f"side{i}": m for i, m in enumerate(modelled)}})
+            return mi.load_dict(
+                {"type": "twosided", **{f"side{i}": m for i, m in enumerate(modelled)}}
+            )
         weight = dict(below)["weight"]
-        return mi.load_dict({"type": "blendbsdf", "weight": weight, "first": modelled[0], "second": modelled[1]})
+        return mi.load_dict(
+            {"type": "blendbsdf", "weight": weight, "first": modelled[0], "second": modelled[1]}
+        )
     if kind in ("BumpMap", "NormalMap", "MaskBSDF"):
         left_out.append(f"{kind}: {_LEFT_OUT[kind]}")
         return _model(next(c for _, c in below if isinstance(c, mi.BSDF)), left_out)
@@ -182,7 +197,12 @@ def _model(bsdf, left_out):
         for share in ("metallic", "spec_trans"):
             if share in textures:  # that share of the surface has no diffuse lobe
                 diffuse = mi.load_dict(
-                    {"type": "blendbsdf", "weight": textures[share], "first": diffuse, "second": _black()}
+                    {
+                        "type": "blendbsdf",
+                        "weight": textures[share],
+                        "first": diffuse,
+                        "second": _black(),
+                    }
                 )
         return diffuse
     left_out.append(f"{kind}: all of its scattering (treated as black)")

@@ -39,7 +39,8 @@ class SceneSource:
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """One shape as it stands in the world: a shape of the scene, or one shape of an instanced group.
+    """One shape as it stands in the world: a shape of the scene, or one shape of an instanced
+    group.
 
     Parameters
     ----------
@@ -65,11 +66,16 @@ class Surface:
 
     @cached_property
     def signature(self):
-        """Kind and place of an analytic shape as text, the same each time the scene is loaded; '' for meshes."""
+        """Kind and place of an analytic shape as text, the same each time the scene is loaded; ''
+        for meshes.
+        """
         if self.kind == "mesh":
             return ""
         if "to_world" not in mitsuba().traverse(self.shape):
-            return f"{self.kind} {self.shape.bbox()} {digest_of([self.shape], lambda key: '.' not in key)}"
+            return (
+                f"{self.kind} {self.shape.bbox()}"
+                f" {digest_of([self.shape], lambda key: '.' not in key)}"
+            )
         place = self.to_world @ transform_of(self.shape)
         flipped = " flipped" if self.shape.has_flipped_normals() else ""
         return self.kind + flipped + " " + " ".join(f"{x:.6g}" for x in place[:3].ravel() + 0.0)
@@ -123,7 +129,9 @@ class Scene:
             if shape.class_name() != "Instance":
                 yield Surface(_name(shape, i), shape, None, np.eye(4), material(shape))
                 continue
-            members = [c for _, c in children(groups[_group_of(shape)]) if isinstance(c, mitsuba().Shape)]
+            members = [
+                c for _, c in children(groups[_group_of(shape)]) if isinstance(c, mitsuba().Shape)
+            ]
             for j, member in enumerate(members):
                 name = f"{_name(shape, i)}/{_name(member, j)}"
                 yield Surface(name, member, shape, transform_of(shape), material(member))
@@ -137,13 +145,16 @@ class Scene:
     def occluders(self):
         """The same shapes as an mi.Scene whose intersections are watertight.
 
-        Embree's robust mode is off in scenes by default; rays that start at vertices then leak through shared edges.
+        Embree's robust mode is off in scenes by default; rays that start at vertices then leak
+        through shared edges.
         """
         return rebuilt_scene([c for _, c in self._children if isinstance(c, mitsuba().Shape)])
 
     @cached_property
     def hash(self):
-        """SHA-256 of what direct transport depends on: the geometry of every surface, and which sides reflect."""
+        """SHA-256 of what direct transport depends on: the geometry of every surface, and which
+        sides reflect.
+        """
         digest = hashlib.sha256()
         for surface in self.surfaces:
             digest.update(f"{surface.kind} {surface.material.two_sided}".encode())
@@ -158,9 +169,14 @@ class Scene:
     @cached_property
     def appearance(self):
         """SHA-256 of the reflectance of every surface, which reflected light depends on."""
-        materials = {material: digest_of([material.modelled]) for material in dict.fromkeys(s.material for s in self.surfaces)}
+        materials = {
+            material: digest_of([material.modelled])
+            for material in dict.fromkeys(s.material for s in self.surfaces)
+        }
         shapes = {s.shape: digest_of([s.shape], _is_appearance) for s in self.surfaces}
-        return hashlib.sha256("".join(materials[s.material] + shapes[s.shape] for s in self.surfaces).encode()).hexdigest()
+        return hashlib.sha256(
+            "".join(materials[s.material] + shapes[s.shape] for s in self.surfaces).encode()
+        ).hexdigest()
 
     def statistics(self):
         """Counts for reports: shapes by kind, triangles, vertices."""
@@ -174,7 +190,8 @@ class Scene:
         }
 
     def modelled(self, keep_local=False):
-        """The scene that the transport stands for: diffuse reflection only, local emitters dark or, with `keep_local`, as they are.
+        """The scene that the transport stands for: diffuse reflection only, local emitters dark or,
+        with `keep_local`, as they are.
 
         Returns
         -------
@@ -186,20 +203,24 @@ class Scene:
         SceneError
             If the scene was given as an mi.Scene and would have to be changed.
         """
-        return self._changed([i for i, s in enumerate(self.surfaces) if s.material.left_out], keep_local)
+        return self._changed(
+            [i for i, s in enumerate(self.surfaces) if s.material.left_out], keep_local
+        )
 
     def unlit(self):
         """The scene as written, but for its local emitters, which are dark; see `modelled`."""
         return self._changed([], keep_local=False)
 
     def _changed(self, replaced, keep_local):
-        """The scene with the modelled materials on some surfaces, and local emitters kept or dark."""
+        """The scene with the modelled materials on some surfaces, and local emitters kept or
+        dark.
+        """
         if not replaced and (keep_local or not self.local_emitters):
             return self.mi_scene
         if self.source.kind == "object" or _holds_objects(self.source.content):
             raise SceneError(
-                "a scene given as Mitsuba objects cannot be rebuilt with diffuse materials and without local emitters: "
-                "pass its path or dict, or compare with reference 'full'"
+                "a scene given as Mitsuba objects cannot be rebuilt with diffuse materials and"
+                " without local emitters: pass its path or dict, or compare with reference 'full'"
             )
         copy = open_scene(self.source.path or self.source.content, self.source.parameters)
         for i in replaced:
@@ -247,7 +268,8 @@ def open_scene(source, parameters=None):
 
 
 def _loaded(what, load, *arguments, **parameters):
-    # optimize=False keeps every shape what it is in the file; parallel=False avoids a known deadlock.
+    # optimize=False keeps every shape what it is in the file; parallel=False avoids a known
+    # deadlock.
     try:
         with a_worker_at_least():
             scene = load(*arguments, optimize=False, parallel=False, **parameters)
@@ -276,7 +298,9 @@ def rebuilt_scene(parts, additions=None):
     entries = {f"part{i}": part for i, part in enumerate(parts)} | (additions or {})
     try:
         return mitsuba().load_dict(
-            {"type": "scene", "embree_use_robust_intersections": True, **entries}, optimize=False, parallel=False
+            {"type": "scene", "embree_use_robust_intersections": True, **entries},
+            optimize=False,
+            parallel=False,
         )
     finally:
         for part, name in zip(parts, ids):
@@ -284,7 +308,8 @@ def rebuilt_scene(parts, additions=None):
 
 
 def scale_of(mi_scene):
-    """Length that offsets and tolerances are measured by: the bounding box's diagonal or the largest coordinate.
+    """Length that offsets and tolerances are measured by: the bounding box's diagonal or the
+    largest coordinate.
 
     Raises
     ------
@@ -292,9 +317,15 @@ def scale_of(mi_scene):
         If the bounding box is not finite.
     """
     box = mi_scene.bbox()
-    low, high = np.array(box.min, dtype=np.float64).ravel(), np.array(box.max, dtype=np.float64).ravel()
+    low, high = (
+        np.array(box.min, dtype=np.float64).ravel(),
+        np.array(box.max, dtype=np.float64).ravel(),
+    )
     if not np.isfinite([low, high]).all():
-        raise SceneError(f"the scene's bounding box {low}…{high} is not finite: a mesh holds NaN or infinite positions")
+        raise SceneError(
+            f"the scene's bounding box {low}…{high} is not finite: a mesh holds NaN or infinite"
+            " positions"
+        )
     return float(max(np.linalg.norm(high - low), np.abs([low, high]).max()))
 
 
@@ -329,7 +360,9 @@ def _holds_objects(content):
 
 
 def _name(shape, index):
-    """A shape's id; one that Mitsuba made up (it holds an address, which changes at each run) is replaced."""
+    """A shape's id; one that Mitsuba made up (it holds an address, which changes at each run) is
+    replaced.
+    """
     made_up = not shape.id() or re.fullmatch(r"(object|_unnamed)_\d+", shape.id())
     return f"{shape.class_name()}-{index}" if made_up else shape.id()
 
@@ -338,19 +371,30 @@ def _group_of(instance):
     """Id of the shape group that an instance shows. Only its printed form tells."""
     found = re.search(r'ShapeGroup\[\s*name = "([^"]*)"', str(instance))
     if not found:
-        raise SceneError(f"the shape group of instance '{instance.id()}' cannot be told: expand it into shapes")
+        raise SceneError(
+            f"the shape group of instance '{instance.id()}' cannot be told: expand it into shapes"
+        )
     return found[1]
 
 
 def _is_appearance(key):
-    """Whether a shape's parameter is one that materials look up: texture coordinates or an attribute such as vertex_color."""
-    return key.startswith(("vertex_", "face_")) and key not in ("vertex_positions", "vertex_normals")
+    """Whether a shape's parameter is one that materials look up: texture coordinates or an
+    attribute such as vertex_color.
+    """
+    return key.startswith(("vertex_", "face_")) and key not in (
+        "vertex_positions",
+        "vertex_normals",
+    )
 
 
 def is_dark(emitter):
     """Whether an emitter sends no light."""
     parameters = mitsuba().traverse(emitter)
-    return not any(np.any(np.array(parameters[key])) for key in _emitted(parameters) if key != "sampling_weight")
+    return not any(
+        np.any(np.array(parameters[key]))
+        for key in _emitted(parameters)
+        if key != "sampling_weight"
+    )
 
 
 def _darken(emitter):
@@ -363,4 +407,5 @@ def _darken(emitter):
 def _emitted(parameters):
     """Keys of what an emitter's light is proportional to, and of how often it is sampled."""
     kinds = ("radiance", "intensity", "irradiance", "sampling_weight")
-    return [key for key in parameters.keys() if key.split(".")[0] in kinds and "to_uv" not in key]  # it iterates over pairs
+    # it iterates over pairs
+    return [key for key in parameters.keys() if key.split(".")[0] in kinds and "to_uv" not in key]

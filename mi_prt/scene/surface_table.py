@@ -32,8 +32,14 @@ class SurfaceTable:
         import drjit as dr
 
         mi = mitsuba()
-        shape, instance = (dr.reinterpret_array(mi.UInt32, pointer) for pointer in (si.shape, si.instance))
-        return dr.select(active, dr.gather(mi.UInt32, self._table, instance * self._shapes + shape, active), NO_SURFACE)
+        shape, instance = (
+            dr.reinterpret_array(mi.UInt32, pointer) for pointer in (si.shape, si.instance)
+        )
+        return dr.select(
+            active,
+            dr.gather(mi.UInt32, self._table, instance * self._shapes + shape, active),
+            NO_SURFACE,
+        )
 
 
 def _registry_id(node):

@@ -8,7 +8,9 @@ from ..system.runtime import mitsuba
 
 
 def children(node):
-    """(name, object) of the objects directly below a Mitsuba object, as its traversal shows them."""
+    """(name, object) of the objects directly below a Mitsuba object, as its traversal shows
+    them.
+    """
     mi = mitsuba()
 
     class Collector(mi.TraversalCallback):
@@ -43,7 +45,8 @@ def digest_of(nodes, keep=lambda key: True):
     for node in nodes:
         digest.update(node.class_name().encode())
         parameters = mitsuba().traverse(node)
-        for key in sorted(key for key in parameters.keys() if keep(key)):  # SceneParameters iterates over pairs
+        # SceneParameters iterates over pairs
+        for key in sorted(key for key in parameters.keys() if keep(key)):
             value = parameters[key]
             value = value.matrix if hasattr(value, "matrix") else value
             digest.update(key.encode() + np.ascontiguousarray(np.array(value)).tobytes())

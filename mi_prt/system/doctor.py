@@ -1,6 +1,8 @@
-"""Examination of the machine: what mi_prt needs, what is there, and what to type where something is missing.
+"""Examination of the machine: what mi_prt needs, what is there, and what to type where something is
+missing.
 
-Whatever could end the process (an unusable LLVM, an OpenGL driver) runs in another one, with a time limit.
+Whatever could end the process (an unusable LLVM, an OpenGL driver) runs in another one, with a time
+limit.
 """
 
 import importlib.metadata
@@ -14,8 +16,7 @@ from pathlib import Path
 
 from packaging.requirements import Requirement
 
-from . import llvm
-from . import runtime
+from . import llvm, runtime
 
 TIME_LIMIT = 120
 """Seconds after which a probe counts as failed."""
@@ -81,8 +82,10 @@ def examine() -> list[Check]:
         Python, each package, LLVM, rays (variant, Embree, threads, CUDA) and raster.
     """
     rays, complaint = _probe(_RAYS_PROBE)
-    checks = [Check("python", "ok", f"{platform.python_version()} ({sys.executable})"),
-              Check("mi_prt", "ok", runtime.package_version("mi_prt"))]
+    checks = [
+        Check("python", "ok", f"{platform.python_version()} ({sys.executable})"),
+        Check("mi_prt", "ok", runtime.package_version("mi_prt")),
+    ]
     checks += [_package(requirement) for requirement in _requirements()]
     checks += [_llvm(rays), _other_llvm(), _rays(rays, complaint)]
     if rays:
@@ -91,7 +94,9 @@ def examine() -> list[Check]:
 
 
 def check_rays() -> Check:
-    """Whether Mitsuba traces a ray and renders with the path integrator in the variant that mi_prt chooses."""
+    """Whether Mitsuba traces a ray and renders with the path integrator in the variant that mi_prt
+    chooses.
+    """
     return _rays(*_probe(_RAYS_PROBE))
 
 
@@ -99,11 +104,20 @@ def check_raster() -> Check:
     """Whether pyrender draws without a screen on the platform that mi_prt chooses."""
     found, complaint = _probe(_RASTER_PROBE)
     if not found:
-        return _fault("raster", complaint, f"install a software renderer: `{runtime.raster_install_command()}`")
+        return _fault(
+            "raster",
+            complaint,
+            f"install a software renderer: `{runtime.raster_install_command()}`",
+        )
     value = f"{found['platform']}: {found['driver']}"
     if found["background"] != 255:
-        return Check("raster", "fault", f"{value} draws white as {found['background']} of 255",
-                     "start with PYOPENGL_PLATFORM=osmesa or PYOPENGL_PLATFORM=egl, whichever is not used here")
+        return Check(
+            "raster",
+            "fault",
+            f"{value} draws white as {found['background']} of 255",
+            "start with PYOPENGL_PLATFORM=osmesa or PYOPENGL_PLATFORM=egl, whichever is not used"
+            " here",
+        )
     return Check("raster", "ok", value)
 
 
@@ -113,18 +127,31 @@ def as_dict(checks: list[Check]) -> dict:
     Returns
     -------
     dict
-        ``ok`` (bool: no check is a fault) and ``checks`` (list of dict with name, status, value, remedy).
+        ``ok`` (bool: no check is a fault) and ``checks`` (list of dict with name, status, value,
+        remedy).
     """
-    return {"ok": all(check.status != "fault" for check in checks), "checks": [asdict(check) for check in checks]}
+    return {
+        "ok": all(check.status != "fault" for check in checks),
+        "checks": [asdict(check) for check in checks],
+    }
 
 
 def _probe(code: str) -> tuple[dict, str]:
-    """Run code in another process: what it printed last, as JSON, and, if it failed, its complaint in one line."""
+    """Run code in another process: what it printed last, as JSON, and, if it failed, its complaint
+    in one line.
+    """
     folder = str(Path(__file__).parents[2])
     path = os.pathsep.join(filter(None, [folder, os.environ.get("PYTHONPATH")]))
     try:
-        run = subprocess.run([sys.executable, "-c", code], env=os.environ | {"PYTHONPATH": path}, capture_output=True,
-                             text=True, errors="replace", timeout=TIME_LIMIT, check=False)
+        run = subprocess.run(
+            [sys.executable, "-c", code],
+            env=os.environ | {"PYTHONPATH": path},
+            capture_output=True,
+            text=True,
+            errors="replace",
+            timeout=TIME_LIMIT,
+            check=False,
+        )
     except subprocess.TimeoutExpired:
         return {}, f"no answer within {TIME_LIMIT} s"
     if run.returncode == 0:
@@ -137,19 +164,25 @@ def _probe(code: str) -> tuple[dict, str]:
 
 
 def _fault(name: str, complaint: str, otherwise: str) -> Check:
-    """A fault from a complaint; our own errors read "cause; remedy", others get the remedy given."""
+    """A fault from a complaint; our own errors read "cause; remedy", others get the remedy
+    given.
+    """
     cause, _, remedy = complaint.partition("; ")
     return Check(name, "fault", cause, remedy or otherwise)
 
 
 def _requirements() -> list[Requirement]:
-    """What mi_prt's metadata says it needs, optional extras left out; names alone if it is run without installation."""
+    """What mi_prt's metadata says it needs, optional extras left out; names alone if it is run
+    without installation.
+    """
     try:
         lines = importlib.metadata.requires("mi_prt") or []
     except importlib.metadata.PackageNotFoundError:
         lines = [package for package in runtime.PACKAGES if package != "mi_prt"]
     requirements = [Requirement(line) for line in lines]
-    return [need for need in requirements if need.marker is None or need.marker.evaluate({"extra": ""})]
+    return [
+        need for need in requirements if need.marker is None or need.marker.evaluate({"extra": ""})
+    ]
 
 
 def _package(need: Requirement) -> Check:
@@ -182,8 +215,10 @@ def _other_llvm() -> Check:
     """LLVM libraries that are there but not used, as information."""
     used = os.path.realpath(llvm.select_llvm() or "")
     others = [library for library in llvm.find_libraries() if library.path != used]
-    named = [f"{library.version or 'unknown'} ({library.path}){'' if library.usable else ' unusable'}"
-             for library in others]
+    named = [
+        f"{library.version or 'unknown'} ({library.path}){'' if library.usable else ' unusable'}"
+        for library in others
+    ]
     return Check("other llvm", "ok", ", ".join(named) or "none")
 
 
@@ -193,7 +228,12 @@ def _rays(rays: dict, complaint: str) -> Check:
     if not rays:
         return _fault("rays", complaint, reinstall)
     if abs(rays["distance"] - 4) > 1e-4:
-        return Check("rays", "fault", f"a ray hit at {rays['distance']} instead of 4 ({rays['variant']})", reinstall)
+        return Check(
+            "rays",
+            "fault",
+            f"a ray hit at {rays['distance']} instead of 4 ({rays['variant']})",
+            reinstall,
+        )
     return Check("rays", "ok", f"traced and rendered in {rays['variant']}")
 
 
@@ -203,15 +243,25 @@ def _threads(rays: dict) -> Check:
 
 def _embree(rays: dict) -> Check:
     if not rays["embree"]:
-        return Check("embree", "warning", "Mitsuba was built without it: rays are slower on the CPU",
-                     f"{sys.executable} -m pip install --force-reinstall mitsuba")
-    return Check("embree", "ok", "used" if rays["variant"].startswith("llvm") else "not used, OptiX is")
+        return Check(
+            "embree",
+            "warning",
+            "Mitsuba was built without it: rays are slower on the CPU",
+            f"{sys.executable} -m pip install --force-reinstall mitsuba",
+        )
+    return Check(
+        "embree", "ok", "used" if rays["variant"].startswith("llvm") else "not used, OptiX is"
+    )
 
 
 def _cuda(rays: dict) -> Check:
     if rays["variant"].startswith("cuda"):
         return Check("cuda", "ok", "used")
     if rays["gpu"]:
-        return Check("cuda", "warning", "a GPU, but its driver's OptiX (libnvoptix.so.1) is missing, so LLVM is used",
-                     "install the complete driver; in a container set NVIDIA_DRIVER_CAPABILITIES=all")
+        return Check(
+            "cuda",
+            "warning",
+            "a GPU, but its driver's OptiX (libnvoptix.so.1) is missing, so LLVM is used",
+            "install the complete driver; in a container set NVIDIA_DRIVER_CAPABILITIES=all",
+        )
     return Check("cuda", "ok", "no GPU, LLVM is used")

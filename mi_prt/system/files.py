@@ -13,7 +13,9 @@ def check_writable(path):
     path = Path(path)
     folder = path.absolute().parent
     if len(os.fsencode(path.name)) > 255:
-        raise SettingsError(f"output name '{path.name[:40]}…' is longer than the 255 bytes that file systems take")
+        raise SettingsError(
+            f"output name '{path.name[:40]}…' is longer than the 255 bytes that file systems take"
+        )
     if path.is_dir():
         raise SettingsError(f"output '{path}' is a folder: give a file name")
     if not folder.is_dir():
@@ -28,12 +30,15 @@ def check_writable(path):
 def replacing(path, folder=None):
     """Name of a new file, which takes the place of `path` once the block has ended without error.
 
-    It is made in the folder of `path`, or in another one on the same file system. A path that is a link stays one.
+    It is made in the folder of `path`, or in another one on the same file system. A path that is a
+    link stays one.
     """
     path = Path(path)
     check_writable(path)
     path = path.resolve()
-    handle, temporary = tempfile.mkstemp(dir=folder or path.parent, prefix=f".{path.name[:40]}.", suffix=".part")
+    handle, temporary = tempfile.mkstemp(
+        dir=folder or path.parent, prefix=f".{path.name[:40]}.", suffix=".part"
+    )
     os.close(handle)
     try:
         yield temporary

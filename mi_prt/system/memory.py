@@ -5,9 +5,13 @@ import psutil
 from ..errors import SettingsError
 
 _UNITS = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
-# Where a control group says its limit, what it uses and what of that is cache, of version 2 and of version 1.
+# Where a control group says its limit, what it uses and what of that is cache, of version 2 and of
+# version 1.
 _CONTROL_GROUPS = {
-    "": ("/sys/fs/cgroup{group}/", ("memory.max", "memory.current", "memory.stat", "inactive_file")),
+    "": (
+        "/sys/fs/cgroup{group}/",
+        ("memory.max", "memory.current", "memory.stat", "inactive_file"),
+    ),
     "memory": (
         "/sys/fs/cgroup/memory{group}/",
         ("memory.limit_in_bytes", "memory.usage_in_bytes", "memory.stat", "total_inactive_file"),
@@ -32,7 +36,9 @@ def parse_bytes(text):
         if not 0 < size < float("inf"):
             raise ValueError
     except ValueError:
-        raise SettingsError(f"memory '{text}' is not a positive number of bytes, such as 3G or 800M") from None
+        raise SettingsError(
+            f"memory '{text}' is not a positive number of bytes, such as 3G or 800M"
+        ) from None
     return int(size)
 
 
@@ -50,14 +56,17 @@ def free_bytes():
         except OSError:
             continue
         if limit != ["max"]:
-            # Pages of files that nobody has open count as used and are given back when memory is asked for.
+            # Pages of files that nobody has open count as used and are given back when memory is
+            # asked for.
             cached = dict(zip(statistics[::2], statistics[1::2])).get(names[3], 0)
             free = min(free, int(limit[0]) - int(used[0]) + int(cached))
     return max(free, 0)
 
 
 def _control_groups():
-    """Folders of the memory control groups that this process may be in: its own, and the root as a container sees it."""
+    """Folders of the memory control groups that this process may be in: its own, and the root as a
+    container sees it.
+    """
     try:
         lines = open("/proc/self/cgroup").read().splitlines()
     except OSError:

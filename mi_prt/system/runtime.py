@@ -1,7 +1,9 @@
-"""The one door to Mitsuba: variant, threads, kernel counts, versions, memory, and the OpenGL platform.
+"""The one door to Mitsuba: variant, threads, kernel counts, versions, memory, and the OpenGL
+platform.
 
-Mitsuba and Dr.Jit are imported inside these functions and nowhere at import time, so that `mi-prt --help` answers at
-once and a machine without a usable LLVM gets a typed error instead of an ended process.
+Mitsuba and Dr.Jit are imported inside these functions and nowhere at import time, so that `mi-prt
+--help` answers at once and a machine without a usable LLVM gets a typed error instead of an ended
+process.
 """
 
 import ctypes
@@ -31,7 +33,12 @@ PACKAGES = ("mi_prt", "mitsuba", "drjit", "numpy", "scipy", "h5py")
 RASTER_PLATFORMS = ("osmesa", "egl")
 """Values of `PYOPENGL_PLATFORM` that draw without a screen, the preferred one first."""
 
-_LIBATOMIC = {"apt-get": "libatomic1", "dnf": "libatomic", "zypper": "libatomic1", "pacman": "gcc-libs"}
+_LIBATOMIC = {
+    "apt-get": "libatomic1",
+    "dnf": "libatomic",
+    "zypper": "libatomic1",
+    "pacman": "gcc-libs",
+}
 
 _RASTER_PACKAGES = {
     "apt-get": "libosmesa6",
@@ -44,22 +51,24 @@ _RASTER_PACKAGES = {
 def mitsuba() -> ModuleType:
     """The `mitsuba` module with a usable variant set.
 
-    A variant of `VARIANTS` that is already set is kept. Without one, `cuda_ad_rgb` is set where Dr.Jit finds a GPU
-    and OptiX, else `llvm_ad_rgb`.
+    A variant of `VARIANTS` that is already set is kept. Without one, `cuda_ad_rgb` is set where
+    Dr.Jit finds a GPU and OptiX, else `llvm_ad_rgb`.
 
     Raises
     ------
     RuntimeSetupError
-        If Mitsuba cannot be imported, if another variant is set, or if the LLVM variant is the one to use and there
-        is no usable LLVM.
+        If Mitsuba cannot be imported, if another variant is set, or if the LLVM variant is the one
+        to use and there is no usable LLVM.
     """
     mi = _load("mitsuba")
     variant = mi.variant()
     if variant is None:
         variant = "cuda_ad_rgb" if cuda_usable() else "llvm_ad_rgb"
     if variant not in VARIANTS:
-        raise RuntimeSetupError(f"the Mitsuba variant {variant} is set, but mi_prt works in {' or '.join(VARIANTS)}; "
-                                f"call mitsuba.set_variant('llvm_ad_rgb') instead, or leave the choice to mi_prt")
+        raise RuntimeSetupError(
+            f"the Mitsuba variant {variant} is set, but mi_prt works in {' or '.join(VARIANTS)}; "
+            "call mitsuba.set_variant('llvm_ad_rgb') instead, or leave the choice to mi_prt"
+        )
     if variant.startswith("llvm"):
         require_llvm()
     if mi.variant() is None:
@@ -68,15 +77,23 @@ def mitsuba() -> ModuleType:
 
 
 def cuda_usable() -> bool:
-    """Whether Dr.Jit finds a GPU and, to trace rays on it, OptiX: containers often pass on one without the other."""
+    """Whether Dr.Jit finds a GPU and, to trace rays on it, OptiX: containers often pass on one
+    without the other.
+    """
     dr, mi = _load("drjit"), _load("mitsuba")
-    return "cuda_ad_rgb" in mi.variants() and bool(dr.has_backend(dr.JitBackend.CUDA)) and _optix_loadable()
+    return (
+        "cuda_ad_rgb" in mi.variants()
+        and bool(dr.has_backend(dr.JitBackend.CUDA))
+        and _optix_loadable()
+    )
 
 
 def quiet_mitsuba() -> None:
-    """Send Mitsuba's messages of level Warn and above to stderr, and drop the rest and its progress bars.
+    """Send Mitsuba's messages of level Warn and above to stderr, and drop the rest and its progress
+    bars.
 
-    Mitsuba logs to stdout, which belongs to the results of a program. Messages may come from its worker threads.
+    Mitsuba logs to stdout, which belongs to the results of a program. Messages may come from its
+    worker threads.
     """
     mi = _load("mitsuba")
 
@@ -108,13 +125,18 @@ def set_threads(count: int) -> None:
     """
     most = THREADS_PER_CORE * (os.cpu_count() or 1)
     if isinstance(count, bool) or not isinstance(count, int) or not 1 <= count <= most:
-        raise SettingsError(f"threads must be an integer from 1 to {most} ({THREADS_PER_CORE} per core), got {count!r}")
+        raise SettingsError(
+            f"threads must be an integer from 1 to {most} ({THREADS_PER_CORE} per core), got"
+            f" {count!r}"
+        )
     _load("drjit").set_thread_count(count)
 
 
 @contextmanager
 def a_worker_at_least():
-    """Within the block Dr.Jit has a thread beside the calling one: Mitsuba hands the loading of images to it, and waits forever without."""
+    """Within the block Dr.Jit has a thread beside the calling one: Mitsuba hands the loading of
+    images to it, and waits forever without.
+    """
     drjit = _load("drjit")
     count = drjit.thread_count()
     drjit.set_thread_count(max(count, 2))
@@ -132,7 +154,8 @@ def thread_count() -> int:
 class KernelCount:
     """Kernels of Dr.Jit since this object was made, until `stop`.
 
-    Dr.Jit's own running totals are compared, so nothing is recorded and memory stays constant over long runs.
+    Dr.Jit's own running totals are compared, so nothing is recorded and memory stays constant over
+    long runs.
     """
 
     def __init__(self):
@@ -146,7 +169,10 @@ class KernelCount:
 
     @property
     def compiled(self) -> int:
-        """Kernels new to this process: compiled, or loaded from Dr.Jit's cache on disk. Repeating one adds nothing."""
+        """Kernels new to this process: compiled, or loaded from Dr.Jit's cache on disk.
+
+        Repeating one adds nothing.
+        """
         return self._since_start(1) + self._since_start(2)
 
     @property
@@ -164,10 +190,11 @@ class KernelCount:
 
 @contextmanager
 def count_kernels() -> Iterator[KernelCount]:
-    """Count the kernels of Dr.Jit within a ``with`` block; blocks may be nested, and counts be read inside and after.
+    """Count the kernels of Dr.Jit within a ``with`` block; blocks may be nested, and counts be read
+    inside and after.
 
-    Only what is evaluated within the block counts: end it with `drjit.eval`. A function that compiles at each call
-    has a literal in it that should be `drjit.opaque`.
+    Only what is evaluated within the block counts: end it with `drjit.eval`. A function that
+    compiles at each call has a literal in it that should be `drjit.opaque`.
 
     Examples
     --------
@@ -197,7 +224,9 @@ def peak_memory_bytes() -> int:
 
 
 def versions() -> dict[str, str]:
-    """Versions of `PACKAGES`, Python, and the LLVM that Dr.Jit runs with ("none" where something is absent)."""
+    """Versions of `PACKAGES`, Python, and the LLVM that Dr.Jit runs with ("none" where something is
+    absent).
+    """
     found = {package: package_version(package) for package in PACKAGES}
     return found | {"python": platform.python_version(), "llvm": _llvm_version()}
 
@@ -211,10 +240,11 @@ def package_version(package: str) -> str:
 
 
 def raster_platform() -> str:
-    """Choose how pyrender opens OpenGL without a screen, by setting `PYOPENGL_PLATFORM`; call it before using pyrender.
+    """Choose how pyrender opens OpenGL without a screen, by setting `PYOPENGL_PLATFORM`; call it
+    before using pyrender.
 
-    A variable that is already set is kept. Else OSMesa is taken if its library is installed, because it needs no
-    driver and draws the same everywhere, else EGL.
+    A variable that is already set is kept. Else OSMesa is taken if its library is installed,
+    because it needs no driver and draws the same everywhere, else EGL.
 
     Returns
     -------
@@ -224,23 +254,29 @@ def raster_platform() -> str:
     Raises
     ------
     RuntimeSetupError
-        If neither library is installed, if the variable names another platform or one that is not installed, or if
-        PyOpenGL was imported before with another platform.
+        If neither library is installed, if the variable names another platform or one that is not
+        installed, or if PyOpenGL was imported before with another platform.
     """
     installed = [name for name in RASTER_PLATFORMS if _installed(name)]
     chosen = os.environ.get("PYOPENGL_PLATFORM") or next(iter(installed), None)
     if chosen is None:
-        raise RuntimeSetupError("neither OSMesa nor EGL is installed, one of which draws without a screen; install it "
-                                f"with `{raster_install_command()}`")
+        raise RuntimeSetupError(
+            "neither OSMesa nor EGL is installed, one of which draws without a screen; install it "
+            f"with `{raster_install_command()}`"
+        )
     if chosen not in installed:
-        raise RuntimeSetupError(f"PYOPENGL_PLATFORM is {chosen}, but what draws without a screen here is "
-                                f"{' or '.join(installed) or 'nothing'}; unset it, or install a platform with "
-                                f"`{raster_install_command()}`")
+        raise RuntimeSetupError(
+            f"PYOPENGL_PLATFORM is {chosen}, but what draws without a screen here is "
+            f"{' or '.join(installed) or 'nothing'}; unset it, or install a platform with "
+            f"`{raster_install_command()}`"
+        )
     loaded = sys.modules.get("OpenGL.platform")
     name = type(loaded.PLATFORM).__name__ if loaded else ""
     if loaded and not name.lower().startswith(chosen):
-        raise RuntimeSetupError(f"PyOpenGL was imported before mi_prt and took {name}, but {chosen} is needed; import "
-                                f"OpenGL and pyrender after mi_prt, or start with PYOPENGL_PLATFORM={chosen}")
+        raise RuntimeSetupError(
+            f"PyOpenGL was imported before mi_prt and took {name}, but {chosen} is needed; import "
+            f"OpenGL and pyrender after mi_prt, or start with PYOPENGL_PLATFORM={chosen}"
+        )
     os.environ["PYOPENGL_PLATFORM"] = chosen
     return chosen
 
@@ -248,8 +284,8 @@ def raster_platform() -> str:
 def pyrender() -> ModuleType:
     """The `pyrender` module, ready to draw without a screen on `raster_platform`.
 
-    Its window class is left out: importing it needs X11 libraries, which servers lack and drawing off screen does not
-    use.
+    Its window class is left out: importing it needs X11 libraries, which servers lack and drawing
+    off screen does not use.
 
     Raises
     ------
@@ -270,27 +306,36 @@ def raster_install_command() -> str:
 
 
 def _load(module: str) -> ModuleType:
-    """Import drjit or mitsuba after the choice of an LLVM; whatever prevents that becomes a typed error."""
+    """Import drjit or mitsuba after the choice of an LLVM; whatever prevents that becomes a typed
+    error.
+    """
     select_llvm()
     try:
         return importlib.import_module(module)
-    except (ImportError, NameError) as error:  # NameError: Dr.Jit's own handling of an ImportError fails
+    # NameError: Dr.Jit's own handling of an ImportError fails
+    except (ImportError, NameError) as error:
         cause = error.__context__ or error
         reinstall = f"{sys.executable} -m pip install --force-reinstall mitsuba drjit"
         remedy = install_command(_LIBATOMIC) if "libatomic" in str(cause) else reinstall
-        raise RuntimeSetupError(f"{module} cannot be imported ({cause}); type `{remedy}`") from error
+        raise RuntimeSetupError(
+            f"{module} cannot be imported ({cause}); type `{remedy}`"
+        ) from error
 
 
 @cache
 def _installed(platform: str) -> bool:
-    """Whether a raster platform's libraries are there; asked once, because each takes a process to find."""
+    """Whether a raster platform's libraries are there; asked once, because each takes a process to
+    find.
+    """
     if platform == "osmesa":
         return find_library("OSMesa") is not None
     return find_library("EGL") is not None and any(map(find_library, ("OpenGL", "GL")))
 
 
 def _optix_loadable() -> bool:
-    """Whether the driver's OptiX library can be loaded; only Linux splits it from the rest of the driver."""
+    """Whether the driver's OptiX library can be loaded; only Linux splits it from the rest of the
+    driver.
+    """
     if sys.platform != "linux":
         return True
     try:

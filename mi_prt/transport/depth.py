@@ -1,9 +1,11 @@
-"""Depth buffers of sample points, compressed cluster by cluster, and what they tell of visibility (Meshless PRT, section 4.2).
+"""Depth buffers of sample points, compressed cluster by cluster, and what they tell of visibility
+(Meshless PRT, section 4.2).
 
-What is compressed is the logarithm of depth. Along a ray a plane lies at h/(n·ω), so that a wall has two terms in the logarithm, one of
-the point and one of the direction; an error of it is a relative error of the depth, the same for near and far occluders, and its range is
-bounded by clamping. Directions count by the cosine that their light arrives with. Encodings, weights and the test were chosen by misclassified
-visibility: docs/meshless.md.
+What is compressed is the logarithm of depth. Along a ray a plane lies at h/(n·ω), so that a wall
+has two terms in the logarithm, one of the point and one of the direction; an error of it is a
+relative error of the depth, the same for near and far occluders, and its range is bounded by
+clamping. Directions count by the cosine that their light arrives with. Encodings, weights and the
+test were chosen by misclassified visibility: docs/meshless.md.
 """
 
 from dataclasses import dataclass
@@ -20,7 +22,8 @@ GRAZING = 0.1  # added to the cosine in the weights of directions, so that the h
 
 @dataclass(frozen=True, eq=False)
 class DepthBuffers:
-    """Log-depth of n points in N directions of their hemispheres, log d = mean + coefficients · vectors.
+    """Log-depth of n points in N directions of their hemispheres, log d = mean + coefficients ·
+    vectors.
 
     Parameters
     ----------
@@ -78,7 +81,10 @@ def compress(distance, extent, hemisphere, count, seed=0):
     weights = np.sqrt(hemisphere.vectors[:, 2] + np.float32(GRAZING))
     left, sizes, right = leading_components((values - mean) * weights, count, seed)
     k = len(sizes)
-    vectors, coefficients = np.zeros((directions, count), np.float32), np.zeros((m, count), np.float32)
+    vectors, coefficients = (
+        np.zeros((directions, count), np.float32),
+        np.zeros((m, count), np.float32),
+    )
     coefficients[:, :k] = left * sizes.astype(np.float32)
     vectors[:, :k] = right.T / weights[:, None]
     return mean, vectors, coefficients

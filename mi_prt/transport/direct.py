@@ -1,4 +1,7 @@
-"""Direct transport T_ij = V·max(0, n·ω) (Eigentransport, eq. 1), sampled by ray queries and kept as visibility bits."""
+"""Direct transport T_ij = V·max(0, n·ω) (Eigentransport, eq.
+
+1), sampled by ray queries and kept as visibility bits.
+"""
 
 from dataclasses import dataclass, replace
 
@@ -16,17 +19,20 @@ BURIED_RAYS = 64
 class DirectTransport:
     """The sampled transport matrix, one bit for every ray.
 
-    T is visibility times a cosine that normals and directions give back, so bits are all that must be stored; and of two
-    opposite directions one lies below the horizon, so one bit serves both. That is 64 times less than float32.
+    T is visibility times a cosine that normals and directions give back, so bits are all that must
+    be stored; and of two opposite directions one lies below the horizon, so one bit serves both.
+    That is 64 times less than float32.
 
     Parameters
     ----------
     normals : (n, 3) float32
     vectors : (r, s/2, 3) float32
-        The r directions sampled in each cell of the first half of the lattice, scaled by the share of the cell's solid
-        angle that each stands for. The cells of the second half are their antipodes.
+        The r directions sampled in each cell of the first half of the lattice, scaled by the share
+        of the cell's solid angle that each stands for. The cells of the second half are their
+        antipodes.
     bits : (n, ceil(s·r/16)) uint8, array or RowFile
-        Visibility along each of `vectors` or its opposite, whichever is above the horizon; packed in their order.
+        Visibility along each of `vectors` or its opposite, whichever is above the horizon; packed
+        in their order.
     rays : int
         Rays traced.
     """
@@ -74,19 +80,27 @@ class DirectTransport:
         return self.rows(slice(None)).astype(dtype or np.float32, copy=False)
 
     def entries(self, cells):
-        """Single entries (n, k) float32 of the matrix: those of each row in cells (n, k), without expanding it."""
+        """Single entries (n, k) float32 of the matrix: those of each row in cells (n, k), without
+        expanding it.
+        """
         rays, half, _ = self.vectors.shape
         ray = np.arange(rays)[:, None, None]
         pair = cells % half
         place = ray * half + pair
         seen = self.bits[np.arange(len(cells))[:, None], place >> 3] >> (7 - (place & 7)) & 1
         cosines = np.einsum("bi,rbki->rbk", self.normals, self.vectors[ray, pair])
-        return np.sum(np.maximum(np.where(cells < half, cosines, -cosines), 0) * seen, axis=0, dtype=np.float32)
+        return np.sum(
+            np.maximum(np.where(cells < half, cosines, -cosines), 0) * seen,
+            axis=0,
+            dtype=np.float32,
+        )
 
     def __matmul__(self, light):
         """Product (n, k) float32 with a matrix (s, k), block by block."""
         starts = range(0, len(self.normals), BLOCK_ROWS)
-        return np.concatenate(list(map_chunks(lambda i: self.rows(slice(i, i + BLOCK_ROWS)) @ light, starts)))
+        return np.concatenate(
+            list(map_chunks(lambda i: self.rows(slice(i, i + BLOCK_ROWS)) @ light, starts))
+        )
 
     def irradiance(self, radiance, solid_angles):
         """Irradiance (n, 3) under cell radiance (s, 3): what no basis has touched."""
@@ -113,7 +127,9 @@ class DirectTransport:
 
     def _of_bits(self, function):
         step = 1 << 14
-        return np.concatenate([function(self.bits[slice(i, i + step)]) for i in range(0, len(self.normals), step)])
+        return np.concatenate(
+            [function(self.bits[slice(i, i + step)]) for i in range(0, len(self.normals), step)]
+        )
 
 
 class DirectSampler:
@@ -144,11 +160,17 @@ class DirectSampler:
     def blocks(self, first=0):
         """Visibility bits (b, row_bytes) uint8 of all points from `first` on, in order."""
         count = len(self._normals)
-        return self._tracer.stream((i, min(self._step, count - i)) for i in range(first, count, self._step))
+        return self._tracer.stream(
+            (i, min(self._step, count - i)) for i in range(first, count, self._step)
+        )
 
     def transport(self, bits):
-        """The transport matrix of the bits of all points: an array, or what gives arrays when it is indexed."""
-        return DirectTransport(self._normals, self._vectors, bits, len(self._normals) * self.rays_per_point)
+        """The transport matrix of the bits of all points: an array, or what gives arrays when it is
+        indexed.
+        """
+        return DirectTransport(
+            self._normals, self._vectors, bits, len(self._normals) * self.rays_per_point
+        )
 
 
 def sample_direct(scene, points, directions, rays_per_direction=1):
@@ -165,8 +187,9 @@ def sample_direct(scene, points, directions, rays_per_direction=1):
 class VisibilityTracer:
     """Occlusion rays from points into fixed directions, in blocks that share one kernel.
 
-    Of two opposite directions one lies above the horizon of any point: each lane traces that one, and none is idle. What
-    changes from block to block is opaque to the compiler; literals would compile a kernel each.
+    Of two opposite directions one lies above the horizon of any point: each lane traces that one,
+    and none is idle. What changes from block to block is opaque to the compiler; literals would
+    compile a kernel each.
 
     Parameters
     ----------
@@ -180,8 +203,9 @@ class VisibilityTracer:
         mi = mitsuba()
         self.occluders = scene.occluders
         self.lanes_per_point = len(vectors)
-        # Rays start on the side of the surface that reflects, and off its rim. One that dips below the faces around its vertex (the
-        # hemisphere of a smooth normal can) runs into them and is blocked, as it is in Mitsuba's own rendering.
+        # Rays start on the side of the surface that reflects, and off its rim. One that dips below
+        # the faces around its vertex (the hemisphere of a smooth normal can) runs into them and is
+        # blocked, as it is in Mitsuba's own rendering.
         origins = points.ray_origins(RAY_OFFSET * scene.scale)
         self._vectors, self._origins, self._normals = (
             mi.Float(np.pad(x, ((0, 0), (0, 1))).ravel())  # 4 floats each: gathered in one load
@@ -199,7 +223,8 @@ class VisibilityTracer:
             return mi.Vector3f(v.x, v.y, v.z)
 
         lane = dr.arange(mi.UInt32, size * self.lanes_per_point)
-        local = lane // self.lanes_per_point  # the divisor is the same in all blocks, so it may be a literal
+        # the divisor is the same in all blocks, so it may be a literal
+        local = lane // self.lanes_per_point
         point = local + dr.opaque(mi.UInt32, first)
         direction = vectors(self._vectors, lane - local * self.lanes_per_point)
         above = dr.mulsign(direction, dr.dot(vectors(self._normals, point), direction))
@@ -208,7 +233,8 @@ class VisibilityTracer:
     def stream(self, blocks):
         """Packed visibility (size, ceil(k/8)) uint8 of each block (first, size).
 
-        Each block is started before the one before it is read, so that rays are traced while bits are packed.
+        Each block is started before the one before it is read, so that rays are traced while bits
+        are packed.
         """
         waiting = None
         for first, size in blocks:
@@ -233,8 +259,9 @@ class VisibilityTracer:
 def find_buried(scene, points, dark, lanes=LANES):
     """Which points without any sky lie inside or against other geometry.
 
-    A point is buried when every ray of its hemisphere ends on the back of a face or nearer than 1e-3 of the scene's
-    scale: feet below the ground, a floor under a box. A dark corner, which other light may reach, is not.
+    A point is buried when every ray of its hemisphere ends on the back of a face or nearer than
+    1e-3 of the scene's scale: feet below the ground, a floor under a box. A dark corner, which
+    other light may reach, is not.
 
     Parameters
     ----------
@@ -259,7 +286,9 @@ def find_buried(scene, points, dark, lanes=LANES):
     # A fixed spherical Fibonacci set, flipped into each hemisphere.
     z = 1 - (np.arange(BURIED_RAYS) + 0.5) * 2 / BURIED_RAYS
     phi = np.arange(BURIED_RAYS) * np.pi * (3 - 5**0.5)
-    vectors = np.stack([np.sqrt(1 - z * z) * np.cos(phi), np.sqrt(1 - z * z) * np.sin(phi), z], axis=-1).astype(np.float32)
+    vectors = np.stack(
+        [np.sqrt(1 - z * z) * np.cos(phi), np.sqrt(1 - z * z) * np.sin(phi), z], axis=-1
+    ).astype(np.float32)
     step = max(1, lanes // BURIED_RAYS)
     for chunk in np.split(index, range(step, len(index), step)):
         normals = np.repeat(points.normals[chunk], BURIED_RAYS, axis=0)

@@ -5,11 +5,14 @@ import numpy as np
 from ..system.runtime import mitsuba
 from .direct import LANES, RAY_OFFSET
 
-RAISE = 0.25  # share of a sample's area whose square root is the least height of a light over it, see `point_irradiance`
+# share of a sample's area whose square root is the least height of a light over it, see
+# `point_irradiance`
+RAISE = 0.25
 
 
 def trace_examples(scene, points, places, lanes=LANES):
-    """Irradiance of sample points under point lights of unit intensity, one block of points after the other.
+    """Irradiance of sample points under point lights of unit intensity, one block of points after
+    the other.
 
     Parameters
     ----------
@@ -32,7 +35,10 @@ def trace_examples(scene, points, places, lanes=LANES):
     mi = mitsuba()
     count = len(places)
     offset = RAY_OFFSET * scene.scale
-    origins, normals = mi.Float(points.ray_origins(offset).ravel()), mi.Float(points.normals.ravel())
+    origins, normals = (
+        mi.Float(points.ray_origins(offset).ravel()),
+        mi.Float(points.normals.ravel()),
+    )
     areas, lights = mi.Float(points.areas), mi.Float(places.ravel())
     step = max(1, lanes // count)
     for first in range(0, len(points), step):
@@ -40,7 +46,10 @@ def trace_examples(scene, points, places, lanes=LANES):
         lane = dr.arange(mi.UInt32, size * count)
         local = lane // count
         point = local + dr.opaque(mi.UInt32, first)
-        origin, normal = dr.gather(mi.Point3f, origins, point), dr.gather(mi.Normal3f, normals, point)
+        origin, normal = (
+            dr.gather(mi.Point3f, origins, point),
+            dr.gather(mi.Normal3f, normals, point),
+        )
         toward = dr.gather(mi.Point3f, lights, lane - local * count) - origin
         height, squared = dr.dot(toward, normal), dr.squared_norm(toward)
         raised = raised_height(height, dr.gather(mi.Float, areas, point))
@@ -49,7 +58,9 @@ def trace_examples(scene, points, places, lanes=LANES):
         ray = mi.Ray3f(origin, toward / distance)
         ray.maxt = dr.maximum(distance - offset, 0)
         lit = facing & ~scene.occluders.ray_test(ray, facing)
-        irradiance = dr.select(lit, raised * (squared - dr.square(height) + dr.square(raised)) ** -1.5, 0)
+        irradiance = dr.select(
+            lit, raised * (squared - dr.square(height) + dr.square(raised)) ** -1.5, 0
+        )
         dr.eval(irradiance)
         yield slice(first, first + size), np.array(irradiance).reshape(size, count)
 
@@ -57,9 +68,10 @@ def trace_examples(scene, points, places, lanes=LANES):
 def raised_height(height, area):
     """Height of a light over a sample, raised so that the sample's value is the mean over its area.
 
-    A light near a surface lights a spot that is smaller than the distance of samples: one that it happens to hit would stand for more
-    light than was sent, up to infinity. A light at the height h over a plane sends I·h/(ρ² + h²)^(3/2) to the distance ρ, which sums up to
-    2πI over the plane for any h: raising it spreads the spot over the samples around and keeps its energy.
+    A light near a surface lights a spot that is smaller than the distance of samples: one that it
+    happens to hit would stand for more light than was sent, up to infinity. A light at the height h
+    over a plane sends I·h/(ρ² + h²)^(3/2) to the distance ρ, which sums up to 2πI over the plane
+    for any h: raising it spreads the spot over the samples around and keeps its energy.
     """
     import drjit as dr
 

@@ -1,7 +1,9 @@
-"""What each sample point sees over its hemisphere: how far, and which sample there (Meshless PRT, sections 4.2 and 4.3).
+"""What each sample point sees over its hemisphere: how far, and which sample there (Meshless PRT,
+sections 4.2 and 4.3).
 
-One set of rays serves both. Distances become depth buffers, which tell whether a local light is visible; the samples that are seen make
-the one-hop transport from point to point, E(x) = Σ_j w_j ρ_j E(y_j) with the cosine-weighted shares w_j of the directions, which sum to one.
+One set of rays serves both. Distances become depth buffers, which tell whether a local light is
+visible; the samples that are seen make the one-hop transport from point to point, E(x) = Σ_j w_j
+ρ_j E(y_j) with the cosine-weighted shares w_j of the directions, which sum to one.
 """
 
 from dataclasses import dataclass
@@ -10,12 +12,13 @@ import numpy as np
 import scipy.sparse
 
 from ..directions.hemisphere import frame_of, frames
+from ..scene.materials import facing, reflectance_at
 from ..system.parallel import map_chunks
 from ..system.runtime import mitsuba
-from ..scene.materials import facing, reflectance_at
 from .direct import LANES, RAY_OFFSET
 
-NOTHING = 0xFFFFFFFF  # in the place of a sample: what is seen reflects nothing, or no sample is near it
+# in the place of a sample: what is seen reflects nothing, or no sample is near it
+NOTHING = 0xFFFFFFFF
 _CHUNK_ROWS = 64  # points whose hops a thread gathers at a time
 
 
@@ -95,24 +98,31 @@ class HemisphereTracer:
         si = self._scene.occluders.ray_intersect(ray)
         normals, si.wi, reflects = facing(si, ray, self._scene.surfaces)
         reflects &= si.is_valid()
-        sample, near = self._locator.nearest(si.p, normals.shading, reflects, (origin, mi.Vector3f(x.z, y.z, z.z)))
+        sample, near = self._locator.nearest(
+            si.p, normals.shading, reflects, (origin, mi.Vector3f(x.z, y.z, z.z))
+        )
         reflectance = reflectance_at(si, self._scene.surfaces, reflects)
         sample = dr.select(reflects & dr.isfinite(near), sample, NOTHING)
         channels = list(reflectance) if self._channels == 3 else [dr.mean(reflectance)]
         dr.eval(si.t, sample, channels)
         albedo = np.stack([np.array(c) for c in channels], axis=-1)
-        return (a.reshape(size, count, *a.shape[1:]) for a in (np.array(si.t), np.array(sample), albedo))
+        return (
+            a.reshape(size, count, *a.shape[1:]) for a in (np.array(si.t), np.array(sample), albedo)
+        )
 
 
 def cluster_frames(normals):
-    """Rotations (m, 3, 3) from the hemisphere's frame to those around the normals of a cluster, as parallel as they can be."""
+    """Rotations (m, 3, 3) from the hemisphere's frame to those around the normals of a cluster, as
+    parallel as they can be.
+    """
     mean = normals.mean(axis=0, dtype=np.float64)
     length = np.linalg.norm(mean)
     return frames(normals, frame_of(mean / length if length > 1e-6 else normals[0]))
 
 
 def gathered(seen, weights, labels, clusters, features):
-    """What points receive from each cluster, for features of samples: Σ_j w_j ρ_j f(y_j) over the directions that see the cluster.
+    """What points receive from each cluster, for features of samples: Σ_j w_j ρ_j f(y_j) over the
+    directions that see the cluster.
 
     Parameters
     ----------
@@ -138,12 +148,18 @@ def gathered(seen, weights, labels, clusters, features):
         size = len(sample)
         found = sample != NOTHING
         column = sample[found].astype(np.int32)
-        row = (np.repeat(np.arange(size), found.sum(axis=1)) * clusters + labels[column]).astype(np.int32)
+        row = (np.repeat(np.arange(size), found.sum(axis=1)) * clusters + labels[column]).astype(
+            np.int32
+        )
         order = np.argsort(row, kind="stable")
-        ends = np.concatenate([[0], np.cumsum(np.bincount(row, minlength=size * clusters))]).astype(np.int32)
+        ends = np.concatenate([[0], np.cumsum(np.bincount(row, minlength=size * clusters))]).astype(
+            np.int32
+        )
         share = (seen.albedo[block] * weights[:, None])[found]
         for channel in range(channels):
-            matrix = scipy.sparse.csr_array((share[order, channel], column[order], ends), (size * clusters, len(features)))
+            matrix = scipy.sparse.csr_array(
+                (share[order, channel], column[order], ends), (size * clusters, len(features))
+            )
             result[block, :, :, channel] = (matrix @ features).reshape(size, clusters, -1)
 
     for _ in map_chunks(gather, range(0, m, _CHUNK_ROWS)):

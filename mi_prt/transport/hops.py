@@ -1,10 +1,11 @@
 """One hop of light between points: what the blocked part of each point's hemisphere looks at.
 
-Light reaches a point x after a reflection from the directions in which x sees a surface,
-E(x) = E_direct(x) + ∫ ρ(y) E(y)/π cos θ dω, y being what is seen there. The integral is a linear operator that takes the
-irradiance of all points to irradiance after one more reflection: the paper's first extension (Eigentransport, section 8), as a
-sparse matrix. Its rows are sampled by rays into just those directions that the direct transport found blocked, so that what escapes
-and what is seen add up to the whole hemisphere: a white furnace is white without noise.
+Light reaches a point x after a reflection from the directions in which x sees a surface, E(x) =
+E_direct(x) + ∫ ρ(y) E(y)/π cos θ dω, y being what is seen there. The integral is a linear operator
+that takes the irradiance of all points to irradiance after one more reflection: the paper's first
+extension (Eigentransport, section 8), as a sparse matrix. Its rows are sampled by rays into just
+those directions that the direct transport found blocked, so that what escapes and what is seen add
+up to the whole hemisphere: a white furnace is white without noise.
 """
 
 from dataclasses import dataclass
@@ -12,16 +13,19 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse
 
-from ..system.parallel import BLOCK_ROWS, map_chunks
 from ..points.locate import PatchLocator
-from ..system.runtime import mitsuba
 from ..scene.materials import facing, reflectance_at
+from ..system.parallel import BLOCK_ROWS, map_chunks
+from ..system.runtime import mitsuba
 from .direct import LANES, RAY_OFFSET
 
-NOTHING = 0xFFFFFFFF  # in the place of a point: what is seen reflects nothing, or nothing that is known
+# in the place of a point: what is seen reflects nothing, or nothing that is known
+NOTHING = 0xFFFFFFFF
 HOP = np.dtype([("point", "<u4"), ("albedo", "<f4", 3)])
-_READ_BYTES = 1 << 22  # of rays that a thread reads at a time; what it makes of them takes three times that
-_LEAST_KEPT = 1e-4  # weight of the points around a hit that are not buried, below which it counts as buried
+# of rays that a thread reads at a time; what it makes of them takes three times that
+_READ_BYTES = 1 << 22
+# weight of the points around a hit that are not buried, below which it counts as buried
+_LEAST_KEPT = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +35,8 @@ class Hops:
     Parameters
     ----------
     rays : (n, 16·K) uint8, array or RowFile
-        `HOP` of each ray: the point seen, picked among the three around the hit by their weights, and the albedo of the hit.
+        `HOP` of each ray: the point seen, picked among the three around the hit by their weights,
+        and the albedo of the hit.
     blocked : (n,) float32
         Share of each point's cosine-weighted hemisphere in which it sees a surface.
     first, stride : int
@@ -61,16 +66,24 @@ class Hops:
 
         def largest(first):
             rays = self._read(first)
-            return rays["albedo"].max(axis=-1, where=(rays["point"] != NOTHING)[..., None], initial=0.0).max(initial=0.0)
+            return (
+                rays["albedo"]
+                .max(axis=-1, where=(rays["point"] != NOTHING)[..., None], initial=0.0)
+                .max(initial=0.0)
+            )
 
         return float(max(map_chunks(largest, self._starts())))
 
     def _starts(self):
-        """The first points of the blocks that are worked on at a time; results do not depend on their size."""
+        """The first points of the blocks that are worked on at a time; results do not depend on
+        their size.
+        """
         return range(0, len(self.blocked), max(1, _READ_BYTES // self.rays.shape[1]))
 
     def _read(self, first):
-        rows = np.ascontiguousarray(self.rays[first : min(first + self._starts().step, len(self.blocked))])
+        rows = np.ascontiguousarray(
+            self.rays[first : min(first + self._starts().step, len(self.blocked))]
+        )
         return rows.view(HOP)[:, self.first :: self.stride]
 
     def apply(self, irradiance):
@@ -95,7 +108,9 @@ class Hops:
             share = self.blocked[first : first + len(rays), None] / np.float32(rays.shape[1])
             for channel, arriving in enumerate(irradiance):
                 weights = (_channel(rays["albedo"], channel, len(irradiance)) * share)[seen]
-                matrix = scipy.sparse.csr_array((weights, columns, ends), (len(rays), len(self.blocked)))
+                matrix = scipy.sparse.csr_array(
+                    (weights, columns, ends), (len(rays), len(self.blocked))
+                )
                 result[channel, first : first + len(rays)] = matrix @ arriving
 
         for _ in map_chunks(product, self._starts()):
@@ -132,12 +147,15 @@ class HopSampler:
         self._locator = PatchLocator(scene, points)
         self._kept = mi.Float(np.where(buried, 0.0, 1.0).astype(np.float32))
         self._origins = mi.Float(points.ray_origins(RAY_OFFSET * scene.scale).ravel())
-        # Cell by cell: a sweep over all directions for each of a cell's rays would meet the strata in the same places again and again.
+        # Cell by cell: a sweep over all directions for each of a cell's rays would meet the strata
+        # in the same places again and again.
         vectors = transport.vectors.swapaxes(0, 1).reshape(-1, 3)
         lengths = np.linalg.norm(vectors, axis=1)  # the share of its cell that each ray stands for
         self._vectors = vectors / lengths[:, None]
         half = len(directions) // 2
-        self._solid_angles = (np.repeat(directions.solid_angles[:half], len(transport.vectors)) * lengths).astype(np.float32)
+        self._solid_angles = (
+            np.repeat(directions.solid_angles[:half], len(transport.vectors)) * lengths
+        ).astype(np.float32)
         self._rays = rays
         self._offsets = np.random.default_rng(seed).random((len(points), 1), dtype=np.float32)
         self._lanes = lanes
@@ -148,12 +166,18 @@ class HopSampler:
     def blocks(self, first=0):
         """Rows (b, row_bytes) uint8 of all points from `first` on, in order."""
         for start in range(first, len(self._points), self._step):
-            yield self.rows(np.arange(start, min(start + self._step, len(self._points)))).view(np.uint8)
+            yield self.rows(np.arange(start, min(start + self._step, len(self._points)))).view(
+                np.uint8
+            )
 
     def rows(self, index):
         """Hops (b, K) of some points."""
-        # Chunks begin at the same points whatever the blocks are: how a matrix product rounds depends on its shape.
-        parts = map_chunks(self._blocked_directions, [index[i : i + BLOCK_ROWS] for i in range(0, len(index), BLOCK_ROWS)])
+        # Chunks begin at the same points whatever the blocks are: how a matrix product rounds
+        # depends on its shape.
+        parts = map_chunks(
+            self._blocked_directions,
+            [index[i : i + BLOCK_ROWS] for i in range(0, len(index), BLOCK_ROWS)],
+        )
         directions, active = (np.concatenate(part) for part in zip(*parts))
         hops = np.empty((len(index), self._rays), HOP)
         step = max(1, self._lanes // self._rays)
@@ -163,17 +187,27 @@ class HopSampler:
         return hops
 
     def _blocked_directions(self, index):
-        """K blocked directions of some points (b, K, 3), stratified, in proportion to cosine times solid angle; and if there are any."""
+        """K blocked directions of some points (b, K, 3), stratified, in proportion to cosine times
+        solid angle; and if there are any.
+        """
         cosines = self._points.normals[index] @ self._vectors.T
         weights = np.abs(cosines) * self._solid_angles
         bits = np.unpackbits(self._transport.bits[index], axis=1, count=cosines.shape[1])
-        weights *= bits.reshape(len(index), len(self._transport.vectors), -1).swapaxes(1, 2).reshape(weights.shape) == 0
+        weights *= (
+            bits.reshape(len(index), len(self._transport.vectors), -1)
+            .swapaxes(1, 2)
+            .reshape(weights.shape)
+            == 0
+        )
         total = np.cumsum(weights, axis=1, dtype=np.float64)
-        # Shifted round by any part of the whole: rays that are left out (see `thinned`) are then missed in other places at each point.
+        # Shifted round by any part of the whole: rays that are left out (see `thinned`) are then
+        # missed in other places at each point.
         wanted = (np.arange(self._rays) / self._rays + self._offsets[index]) % 1 * total[:, -1:]
         # Rows one behind the other make a single ascending sequence to search in.
         before = np.cumsum(np.append(0, total[:-1, -1]))[:, None]
-        ray = np.searchsorted((total + before).ravel(), (wanted + before).ravel(), side="right").reshape(wanted.shape)
+        ray = np.searchsorted(
+            (total + before).ravel(), (wanted + before).ravel(), side="right"
+        ).reshape(wanted.shape)
         ray = np.clip(ray - np.arange(len(index))[:, None] * total.shape[1], 0, total.shape[1] - 1)
         sign = np.where(np.take_along_axis(cosines, ray, axis=1) < 0, np.float32(-1), np.float32(1))
         return self._vectors[ray] * sign[..., None], total[:, -1] > 0
@@ -183,8 +217,9 @@ class HopSampler:
 
         mi = mitsuba()
         lanes = len(index) * self._rays
-        # Arrays go over flat and come back by component: those of other shapes compile a kernel for each size. And they are gathered
-        # from: those that are read lane by lane compile another kernel where their memory is aligned otherwise.
+        # Arrays go over flat and come back by component: those of other shapes compile a kernel for
+        # each size. And they are gathered from: those that are read lane by lane compile another
+        # kernel where their memory is aligned otherwise.
         lane = dr.arange(mi.UInt32, lanes)
         local = lane // self._rays
         owner = dr.gather(mi.UInt32, mi.UInt32(index.astype(np.uint32)), local)
@@ -198,11 +233,15 @@ class HopSampler:
         kept = [w * dr.gather(mi.Float, self._kept, p, found) for p, w in zip(points, weights)]
         total = kept[0] + kept[1] + kept[2]
         found &= total > _LEAST_KEPT
-        # One of the three by their weights: interpolation in the mean, with a third of the entries. The number is hashed from point
-        # and ray, so that it depends on nothing else.
-        number = lane - local * self._rays + dr.opaque(mi.UInt32, self._seed * self._rays % (1 << 32))
+        # One of the three by their weights: interpolation in the mean, with a third of the entries.
+        # The number is hashed from point and ray, so that it depends on nothing else.
+        number = (
+            lane - local * self._rays + dr.opaque(mi.UInt32, self._seed * self._rays % (1 << 32))
+        )
         picked = mi.sample_tea_float32(owner, number) * total
-        point = dr.select(picked < kept[0], points[0], dr.select(picked < kept[0] + kept[1], points[1], points[2]))
+        point = dr.select(
+            picked < kept[0], points[0], dr.select(picked < kept[0] + kept[1], points[1], points[2])
+        )
         albedo = reflectance_at(si, self._scene.surfaces, found)
         point = dr.select(found & (dr.max(albedo) > 0), point, NOTHING)
         hops = np.empty(lanes, HOP)
@@ -216,7 +255,8 @@ class HopSampler:
 def blocked_share(transport, solid_angles):
     """Share (n,) float32 of each point's cosine-weighted hemisphere in which it sees a surface.
 
-    It is what the visible part leaves of π, so that no energy comes from the quadrature; where every ray escapes it is zero.
+    It is what the visible part leaves of π, so that no energy comes from the quadrature; where
+    every ray escapes it is zero.
     """
     weights = (solid_angles / np.pi).astype(np.float32)[:, None]
     visible = (transport @ weights)[:, 0]

@@ -1,8 +1,9 @@
 """Light after any number of reflections, from the operator of one (`Hops`).
 
-With A that operator, irradiance after k reflections is Aᵏ·E₀ and all of it E = E₀ + A·E: the Neumann series of (I − A)⁻¹. Both work on
-whatever is linear in light: on the coefficients of direct transport in a basis, so that no matrix of points × directions is needed,
-and the same rays serve any number of reflections.
+With A that operator, irradiance after k reflections is Aᵏ·E₀ and all of it E = E₀ + A·E: the
+Neumann series of (I − A)⁻¹. Both work on whatever is linear in light: on the coefficients of direct
+transport in a basis, so that no matrix of points × directions is needed, and the same rays serve
+any number of reflections.
 """
 
 from dataclasses import dataclass
@@ -33,10 +34,11 @@ class BounceSplit:
     Parameters
     ----------
     energy : tuple of float
-        Mean irradiance over the surface (weighted by area, mean of the colour channels) in units of π, what an open sky gives: direct,
-        after one reflection, after two, ….
+        Mean irradiance over the surface (weighted by area, mean of the colour channels) in units of
+        π, what an open sky gives: direct, after one reflection, after two, ….
     left : float
-        What further reflections would add, in the same unit, or a bound of it; inf where none is known.
+        What further reflections would add, in the same unit, or a bound of it; inf where none is
+        known.
     """
 
     energy: tuple
@@ -60,7 +62,8 @@ def split_by_bounces(hops, direct, weights, channels, bounces=None):
         The points' share in the mean, summing to 1.
     channels : 1 or 3
     bounces : int or None
-        How many reflections; None for as many as it takes until what is left is below `BOUNCE_TOLERANCE` of the whole.
+        How many reflections; None for as many as it takes until what is left is below
+        `BOUNCE_TOLERANCE` of the whole.
 
     Returns
     -------
@@ -84,11 +87,13 @@ def split_by_bounces(hops, direct, weights, channels, bounces=None):
         energy.append(_mean(term, weights))
         if not np.isfinite(energy[-1]):
             raise SceneError(
-                f"light grows without bound within {len(energy) - 1} reflections: a surface reflects {albedo:.4g} times the light that arrives at "
-                "it; correct its reflectance, or use fewer bounces (--bounces)"
+                f"light grows without bound within {len(energy) - 1} reflections: a surface"
+                f" reflects {albedo:.4g} times the light that arrives at it; correct its"
+                " reflectance, or use fewer bounces (--bounces)"
             )
-        # A reflection leaves at most the largest albedo of the flux that arrives at all surfaces, and a mean weighted by area is flux.
-        # Where that is nearly all, the bound is of no use, and what all reflections come to is solved for.
+        # A reflection leaves at most the largest albedo of the flux that arrives at all surfaces,
+        # and a mean weighted by area is flux. Where that is nearly all, the bound is of no use, and
+        # what all reflections come to is solved for.
         bound = energy[-1] * albedo / (1 - albedo) if albedo < 1 else np.inf
         left = min(bound, max(whole - sum(energy), 0.0))
         if left <= (BOUNCE_TOLERANCE if bounces is None else ROUNDING) * sum(energy):
@@ -99,11 +104,13 @@ def split_by_bounces(hops, direct, weights, channels, bounces=None):
 
 
 def check_ending(albedo):
-    """Raise SceneError where any number of reflections need not end, because a surface of this albedo reflects more than arrives."""
+    """Raise SceneError where any number of reflections need not end, because a surface of this
+    albedo reflects more than arrives.
+    """
     if albedo > 1 + ALBEDO_ROUNDING:
         raise SceneError(
-            f"a surface reflects {albedo:.4g} times the light that arrives at it, so reflections need not end: correct its reflectance, or "
-            "give a number of bounces (--bounces)"
+            f"a surface reflects {albedo:.4g} times the light that arrives at it, so reflections"
+            " need not end: correct its reflectance, or give a number of bounces (--bounces)"
         )
 
 
@@ -121,7 +128,8 @@ def solve(hops, direct, channels, split, progress=lambda done: None):
         Coefficients of direct transport, without a mean taken off.
     channels : 1 or 3
     split : BounceSplit or None
-        How many reflections, and how much energy each has: rays are spent in proportion to it. None for all of them.
+        How many reflections, and how much energy each has: rays are spent in proportion to it. None
+        for all of them.
     progress : callable(done)
         Called with the columns that are done.
 
@@ -135,12 +143,16 @@ def solve(hops, direct, channels, split, progress=lambda done: None):
         If all reflections are wanted and they do not end.
     """
     n, m = direct.shape
-    operators = [] if split is None else [hops.thinned(factor) for factor in _thinning(split, hops.count)]
+    operators = (
+        [] if split is None else [hops.thinned(factor) for factor in _thinning(split, hops.count)]
+    )
     indirect = np.empty((channels, n, m), np.float32)
     for first in range(0, m, COLUMNS):
         columns = slice(first, first + COLUMNS)
         emitted = np.broadcast_to(direct[:, columns], (channels, n, len(direct[0, columns])))
-        indirect[..., columns] = _converged(hops, emitted) if split is None else _summed(operators, emitted)
+        indirect[..., columns] = (
+            _converged(hops, emitted) if split is None else _summed(operators, emitted)
+        )
         progress(min(first + COLUMNS, m))
     return indirect
 
@@ -148,8 +160,9 @@ def solve(hops, direct, channels, split, progress=lambda done: None):
 def _thinning(split, rays):
     """Of each reflection, by what power of two its rays may be thinned.
 
-    Noise of a reflection goes with its energy over the square root of its rays; what all reflections together have is least, for so many
-    rays in all, where these are in proportion to the energy.
+    Noise of a reflection goes with its energy over the square root of its rays; what all
+    reflections together have is least, for so many rays in all, where these are in proportion to
+    the energy.
     """
     first = split.energy[1]
     for energy in split.energy[1:]:
@@ -160,8 +173,9 @@ def _thinning(split, rays):
 def _summed(operators, direct):
     """A₁·(E₀ + A₂·(E₀ + …)), from the innermost on.
 
-    What a point receives is gathered by A₁ with all its rays, whatever reflection it is of; and as what each operator gathers adds up
-    to the same share of the hemisphere, a white furnace stays white though they differ. A₁·E₀ + A₂·A₁·E₀ + … would do neither.
+    What a point receives is gathered by A₁ with all its rays, whatever reflection it is of; and as
+    what each operator gathers adds up to the same share of the hemisphere, a white furnace stays
+    white though they differ. A₁·E₀ + A₂·A₁·E₀ + … would do neither.
     """
     arriving = direct
     for operator in operators[:0:-1]:
@@ -178,18 +192,25 @@ def _converged(hops, direct):
         return (irradiance - hops.apply(irradiance)).ravel()
 
     operator = LinearOperator((first.size, first.size), matvec=remaining, dtype=np.float32)
-    solution, failed = bicgstab(operator, first.ravel(), rtol=SOLVER_TOLERANCE, atol=0.0, maxiter=MOST_ITERATIONS)
+    solution, failed = bicgstab(
+        operator, first.ravel(), rtol=SOLVER_TOLERANCE, atol=0.0, maxiter=MOST_ITERATIONS
+    )
     if failed:
-        raise SceneError("light between the scene's surfaces does not die away: give a number of bounces (--bounces)")
+        raise SceneError(
+            "light between the scene's surfaces does not die away: give a number of bounces"
+            " (--bounces)"
+        )
     return solution.reshape(first.shape)
 
 
 def combined(halves, kept, denoise=True):
-    """One estimate of coefficients from two that are independent and equally good, with the noise taken out that can be told.
+    """One estimate of coefficients from two that are independent and equally good, with the noise
+    taken out that can be told.
 
-    Their covariance is that of the signal, half the variance of their difference twice the noise of their mean. Components that
-    diagonalize both (maximum noise fraction, Green et al. 1988) are scaled by the share of their variance that is signal: the linear
-    filter with the least mean squared error. Components that are all noise go; what both halves agree on stays as it is.
+    Their covariance is that of the signal, half the variance of their difference twice the noise of
+    their mean. Components that diagonalize both (maximum noise fraction, Green et al. 1988) are
+    scaled by the share of their variance that is signal: the linear filter with the least mean
+    squared error. Components that are all noise go; what both halves agree on stays as it is.
 
     Parameters
     ----------
@@ -220,20 +241,26 @@ def combined(halves, kept, denoise=True):
     with one_blas_thread():
         values, vectors = scipy.linalg.eigh(total)
         significant = values > values[-1] * m * np.finfo(np.float32).eps
-        # Coordinates in which the coefficients have unit variance; the noise is then at most all of it.
+        # Coordinates in which the coefficients have unit variance; the noise is then at most all of
+        # it.
         whiten = vectors[:, significant] / np.sqrt(values[significant])
         fractions, rotation = scipy.linalg.eigh(whiten.T @ noise @ whiten)
         gains = np.clip(1 - fractions, 0, 1)
         back = rotation.T @ (vectors[:, significant] * np.sqrt(values[significant])).T
-        taken = (whiten @ rotation * (1 - gains)) @ back  # what the filter takes away of a deviation from the mean
-        passed = float(np.trace((np.eye(m) - taken).T @ noise @ (np.eye(m) - taken)) / np.trace(noise))
+        # what the filter takes away of a deviation from the mean
+        taken = (whiten @ rotation * (1 - gains)) @ back
+        passed = float(
+            np.trace((np.eye(m) - taken).T @ noise @ (np.eye(m) - taken)) / np.trace(noise)
+        )
         for channel in first:
             channel -= (channel - centre.astype(np.float32)) @ taken.astype(np.float32)
     return first, size, passed
 
 
 def _moments(mean, difference, kept):
-    """Scatter matrices (m, m) of the mean (about its centre) and of its noise, and the centre (m,), over points and channels."""
+    """Scatter matrices (m, m) of the mean (about its centre) and of its noise, and the centre (m,),
+    over points and channels.
+    """
     m = mean.shape[-1]
     total, noise, centre, count = np.zeros((m, m)), np.zeros((m, m)), np.zeros(m), 0
     with one_blas_thread():

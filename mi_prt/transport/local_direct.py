@@ -1,8 +1,10 @@
-"""Direct light of local emission at sample points, in one kernel of Dr.Jit (Meshless PRT, section 5).
+"""Direct light of local emission at sample points, in one kernel of Dr.Jit (Meshless PRT, section
+5).
 
-For each point and each emitting place: the four directions of the depth buffer around the way to it, their depths from the coefficients of
-the point, and a soft comparison with the distance, four times. What changes from call to call is read from memory, so that lights
-move, change and multiply without a new kernel.
+For each point and each emitting place: the four directions of the depth buffer around the way to
+it, their depths from the coefficients of the point, and a soft comparison with the distance, four
+times. What changes from call to call is read from memory, so that lights move, change and multiply
+without a new kernel.
 """
 
 import numpy as np
@@ -14,14 +16,21 @@ from .examples import raised_height
 from .hemispheres import cluster_frames
 
 TOLERANCE = 0.1  # share of its distance by which a light may lie behind what the depth buffer shows
-BEHIND = 0.03  # the same for points behind the surface that is nearest to the light, so that none leaks through it
-CLEARANCE = 0.25  # share of its distance by which a light is taken to lie off the nearest surface, on its own side of it
+# the same for points behind the surface that is nearest to the light, so that none leaks through it
+BEHIND = 0.03
+# share of its distance by which a light is taken to lie off the nearest surface, on its own side of
+# it
+CLEARANCE = 0.25
 SOFTNESS = 0.15  # share of the distance over which the comparison goes from dark to lit
 FAR = 0.8  # share of the extent from which on all light is equally far
-CELLS = 1.0  # of the depth buffer, in which a light is seen off the nearest surface at least, so that its neighbours see past that
+# of the depth buffer, in which a light is seen off the nearest surface at least, so that its
+# neighbours see past that
+CELLS = 1.0
 NEIGHBOURS = 256  # samples around a place that tell what it stands over
 UNDER = 2.0  # radii that a sample may lie beside a place which stands over it
-ROOM = 0.5  # share of the way to the nearest surface ahead by which a place may be moved, and as much be tolerated
+# share of the way to the nearest surface ahead by which a place may be moved, and as much be
+# tolerated
+ROOM = 0.5
 AHEAD = 0.2  # cosine to the normal of that, from which on other samples are ahead of a place
 ON_SURFACE = 1e-3  # radii of samples from a surface, below which a place is on it
 
@@ -41,16 +50,26 @@ class LocalDirect:
         mi = mitsuba()
         points = samples.points
         self._count = len(points)
-        self._tree, self._normals, self._radius = cKDTree(points.positions), points.normals, samples.radius
+        self._tree, self._normals, self._radius = (
+            cKDTree(points.positions),
+            points.normals,
+            samples.radius,
+        )
         self._hemisphere, self._directions = depth.hemisphere, depth.means.shape[1]
-        self._groups = -(-depth.coefficients.shape[1] // 4)  # of four components: gathered in one load
+        # of four components: gathered in one load
+        self._groups = -(-depth.coefficients.shape[1] // 4)
         extra = 4 * self._groups - depth.coefficients.shape[1]
         self._means = mi.Float(depth.means.ravel())
         self._vectors = mi.Float(np.pad(depth.vectors, ((0, 0), (0, 0), (0, extra))).ravel())
         self._coefficients = mi.Float(np.pad(depth.coefficients, ((0, 0), (0, extra))).ravel())
         self._labels = mi.UInt32(samples.labels.astype(np.uint32))
-        rotations = np.concatenate([cluster_frames(points.normals[cluster]) for cluster in samples.clusters])
-        axes = (np.pad(axis, ((0, 0), (0, 1))) for axis in np.moveaxis(rotations.astype(np.float32), 2, 0))
+        rotations = np.concatenate(
+            [cluster_frames(points.normals[cluster]) for cluster in samples.clusters]
+        )
+        axes = (
+            np.pad(axis, ((0, 0), (0, 1)))
+            for axis in np.moveaxis(rotations.astype(np.float32), 2, 0)
+        )
         self._points = mi.Float(np.hstack([points.positions, points.areas[:, None], *axes]).ravel())
         self._far = dr.opaque(mi.Float, FAR * depth.extent)
         self._cell = dr.opaque(mi.Float, CELLS * (2 * np.pi / self._directions) ** 0.5)
@@ -65,7 +84,8 @@ class LocalDirect:
         Returns
         -------
         irradiance, averaged : (n, 3) float32
-            W/m². The second is what is reflected: finite wherever a light stands, see `raised_height`.
+            W/m². The second is what is reflected: finite wherever a light stands, see
+            `raised_height`.
         """
         import drjit as dr
 
@@ -82,23 +102,36 @@ class LocalDirect:
             toward, intensity, (side, room) = places.sent(number, position)
             distance, height = dr.norm(toward), dr.dot(toward, axes[2])
             lit = (height > 0) & (dr.max(intensity) > 0)
-            # A light near a surface is taken farther off it, on the side where it stands: depth is not as exact as to tell them apart.
+            # A light near a surface is taken farther off it, on the side where it stands: depth is
+            # not as exact as to tell them apart.
             normal = mi.Vector3f(side.x, side.y, side.z)
             in_front = dr.dot(toward, normal) < 0
             free = dr.select(in_front, room.x, dr.inf)
-            pushed = toward + normal * dr.maximum(dr.minimum(CLEARANCE * distance, free) - side.w, 0)
-            tolerated = dr.minimum(dr.select(in_front, mi.Float(TOLERANCE), BEHIND) * distance, free)
+            pushed = toward + normal * dr.maximum(
+                dr.minimum(CLEARANCE * distance, free) - side.w, 0
+            )
+            tolerated = dr.minimum(
+                dr.select(in_front, mi.Float(TOLERANCE), BEHIND) * distance, free
+            )
             compared = dr.minimum(dr.norm(pushed) - tolerated, self._far)
-            seen_in = toward + normal * dr.maximum(dr.minimum(self._cell * distance, free) - side.w, 0)
+            seen_in = toward + normal * dr.maximum(
+                dr.minimum(self._cell * distance, free) - side.w, 0
+            )
             local = dr.normalize(mi.Vector3f(*(dr.dot(seen_in, x) for x in axes)))
-            visible = dr.if_stmt((point, local, compared), lit, self._visibility, lambda *_: mi.Float(0))
+            visible = dr.if_stmt(
+                (point, local, compared), lit, self._visibility, lambda *_: mi.Float(0)
+            )
             squared = dr.square(distance)
             raised = raised_height(height, area)
             spread = raised * (squared - dr.square(height) + dr.square(raised)) ** -1.5
             here = height / (squared * distance)
             here = dr.select(dr.isfinite(here), here, 0)
             factor = dr.select(lit, visible, 0)
-            return number + 1, at_point + intensity * (factor * here), averaged + intensity * (factor * spread)
+            return (
+                number + 1,
+                at_point + intensity * (factor * here),
+                averaged + intensity * (factor * spread),
+            )
 
         state = (mi.UInt32(0), mi.Color3f(0), mi.Color3f(0))
         _, *sums = dr.while_loop(state, lambda number, *_: number < places.count, add)
@@ -107,14 +140,21 @@ class LocalDirect:
         return (np.minimum(np.array(x).T, largest) for x in sums)
 
     def _sides(self, emission):
-        """For each place (k, 8): the normal of the surface that it stands over, on its side; how far from that it is; and how far it may be
-        moved."""
+        """For each place (k, 8): the normal of the surface that it stands over, on its side; how
+        far from that it is; and how far it may be moved.
+        """
         k = min(NEIGHBOURS, self._count)
-        distance, near = (x.reshape(len(emission), -1) for x in self._tree.query(emission.positions, k, workers=-1))
+        distance, near = (
+            x.reshape(len(emission), -1)
+            for x in self._tree.query(emission.positions, k, workers=-1)
+        )
         normals = self._normals[near]
-        height = np.einsum("ijk,ijk->ij", emission.positions[:, None] - self._tree.data[near], normals)
+        height = np.einsum(
+            "ijk,ijk->ij", emission.positions[:, None] - self._tree.data[near], normals
+        )
         beside = np.sqrt(np.maximum(distance**2 - height**2, 0))
-        # Not just the nearest sample: outside an edge of a room that is one of a wall that the place does not stand over.
+        # Not just the nearest sample: outside an edge of a room that is one of a wall that the
+        # place does not stand over.
         under = np.argmin(np.where(beside < UNDER * self._radius, distance, np.inf), axis=1)
         row = np.arange(len(emission))
         normal, height = normals[row, under], height[row, under]
@@ -122,7 +162,10 @@ class LocalDirect:
         on_surface = (np.abs(height) < ON_SURFACE * self._radius) & (emission.cosine > 0)
         side = np.where(on_surface, np.einsum("ij,ij->i", emission.axes, normal), height)
         away = np.where(side < 0, -1, 1)[:, None] * normal
-        ahead = np.einsum("ijk,ik->ij", self._tree.data[near] - emission.positions[:, None], away) > AHEAD * distance
+        ahead = (
+            np.einsum("ijk,ik->ij", self._tree.data[near] - emission.positions[:, None], away)
+            > AHEAD * distance
+        )
         room = np.where(ahead, distance, distance[:, -1:]).min(axis=1) * ROOM
         columns = (away, np.abs(height)[:, None], room[:, None], np.zeros((len(emission), 3)))
         return np.hstack(columns)
@@ -132,13 +175,18 @@ class LocalDirect:
         import drjit as dr
 
         mi = mitsuba()
-        own = [dr.gather(mi.Vector4f, self._coefficients, point * self._groups + i) for i in range(self._groups)]
+        own = [
+            dr.gather(mi.Vector4f, self._coefficients, point * self._groups + i)
+            for i in range(self._groups)
+        ]
         cluster = dr.gather(mi.UInt32, self._labels, point) * self._directions
         visible = mi.Float(0)
         for index, share in zip(*self._hemisphere.around(local)):
             entry = cluster + index
             depth = dr.gather(mi.Float, self._means, entry)
             for i, coefficients in enumerate(own):
-                depth += dr.dot(coefficients, dr.gather(mi.Vector4f, self._vectors, entry * self._groups + i))
+                depth += dr.dot(
+                    coefficients, dr.gather(mi.Vector4f, self._vectors, entry * self._groups + i)
+                )
             visible += share * dr.clip((dr.exp(depth) / compared - 1) / SOFTNESS + 0.5, 0, 1)
         return visible

@@ -1,24 +1,27 @@
 """Indirect transport by paths: unbiased, and slower than `hops` for the same noise.
 
-A path starts at a point, is reflected from surface to surface, and counts in the direction in which it leaves the scene; its cost does
-not depend on the number of directions. The light is not known when transport is computed, every direction shines alike, and so there
-is no emitter to aim at: leaving in a direction of the reflection's own cosine distribution is the best estimate of a single path.
-(Aiming at what the points at the next hit see of the sky is what `hops` do.)
+A path starts at a point, is reflected from surface to surface, and counts in the direction in which
+it leaves the scene; its cost does not depend on the number of directions. The light is not known
+when transport is computed, every direction shines alike, and so there is no emitter to aim at:
+leaving in a direction of the reflection's own cosine distribution is the best estimate of a single
+path. (Aiming at what the points at the next hit see of the sky is what `hops` do.)
 """
 
 import numpy as np
 import scipy.sparse
 
+from ..scene.materials import facing, reflectance_at
 from ..system.parallel import BLOCK_ROWS, map_chunks
 from ..system.runtime import mitsuba
-from ..scene.materials import facing, reflectance_at
 from .direct import LANES, RAY_OFFSET
 from .hops import NOTHING
 
 ROULETTE_FROM = 3  # reflections after which a path may end by chance
 MOST_LIKELY = 0.95  # probability of going on: below 1, so that paths end between white walls too
-ENERGY_BINS = 64  # of the numbers of reflections that energy is told for; the last one holds all higher ones
-_PLASTIC = 0.7548776662466927, 0.5698402909980532  # Roberts' R2 sequence: the powers of the inverse plastic number
+# of the numbers of reflections that energy is told for; the last one holds all higher ones
+ENERGY_BINS = 64
+# Roberts' R2 sequence: the powers of the inverse plastic number
+_PLASTIC = 0.7548776662466927, 0.5698402909980532
 
 
 class PathSampler:
@@ -41,7 +44,9 @@ class PathSampler:
         Most paths of one wavefront. Results do not depend on it.
     """
 
-    def __init__(self, scene, points, directions, paths, bounces, channels, encode, seed=0, lanes=LANES):
+    def __init__(
+        self, scene, points, directions, paths, bounces, channels, encode, seed=0, lanes=LANES
+    ):
         import drjit as dr
 
         mi = mitsuba()
@@ -60,13 +65,17 @@ class PathSampler:
         return 4 * (2 * self._channels * components + ENERGY_BINS)
 
     def blocks(self, first=0):
-        """Rows (b, row_bytes(m)) uint8 of all points from `first` on, in order: float32 coefficients (2, c, m) of the paths with an
-        even and an odd number, and the energy of 1…64 reflections (see `energies`)."""
+        """Rows (b, row_bytes(m)) uint8 of all points from `first` on, in order: float32
+        coefficients (2, c, m) of the paths with an even and an odd number, and the energy of 1…64
+        reflections (see `energies`).
+        """
         for start in range(first, self._count, self._step):
             index = np.arange(start, min(start + self._step, self._count))
             escapes = self.escapes(index)
             chunks = np.array_split(np.arange(len(index)), -(-len(index) // BLOCK_ROWS))
-            rows = np.concatenate(list(map_chunks(lambda chunk: self._row([x[chunk] for x in escapes]), chunks)))
+            rows = np.concatenate(
+                list(map_chunks(lambda chunk: self._row([x[chunk] for x in escapes]), chunks))
+            )
             yield np.ascontiguousarray(rows).view(np.uint8)
 
     def _row(self, escapes):
@@ -78,7 +87,9 @@ class PathSampler:
         return np.concatenate([*halves, energies(escapes, self._paths)], axis=1, dtype=np.float32)
 
     def transport(self, escapes):
-        """Rows of indirect transport, a sparse (b, s) for each channel, of paths (cell, throughput, reflections) (b, k)."""
+        """Rows of indirect transport, a sparse (b, s) for each channel, of paths (cell, throughput,
+        reflections) (b, k).
+        """
         cell, throughput, _ = escapes
         b, k = cell.shape
         seen = cell != NOTHING
@@ -87,7 +98,10 @@ class PathSampler:
         scale = (np.pi / k / self._directions.solid_angles[columns]).astype(np.float32)
         carried = throughput[seen]
         carried = carried.T if self._channels == 3 else carried.mean(axis=1)[None]
-        return [scipy.sparse.csr_array((c * scale, columns, ends), (b, len(self._directions))) for c in carried]
+        return [
+            scipy.sparse.csr_array((c * scale, columns, ends), (b, len(self._directions)))
+            for c in carried
+        ]
 
     def escapes(self, index):
         """Where the paths of some points leave.
@@ -109,12 +123,16 @@ class PathSampler:
         cell = np.full(len(vectors), NOTHING, np.uint32)
         left = np.flatnonzero(reflections)
         chunks = np.array_split(left, -(-len(left) // 100_000) or 1)
-        for chunk, cells in zip(chunks, map_chunks(lambda chunk: self._directions.cells(vectors[chunk]), chunks)):
+        for chunk, cells in zip(
+            chunks, map_chunks(lambda chunk: self._directions.cells(vectors[chunk]), chunks)
+        ):
             cell[chunk] = cells
         return cell.reshape(shape), throughput.reshape(*shape, 3), reflections.reshape(shape)
 
     def _traced(self, index):
-        """Direction (k, 3), throughput (k, 3) and number of reflections (k,) of escaped paths; 0 reflections for all others."""
+        """Direction (k, 3), throughput (k, 3) and number of reflections (k,) of escaped paths; 0
+        reflections for all others.
+        """
         import drjit as dr
 
         mi = mitsuba()
@@ -125,14 +143,20 @@ class PathSampler:
         number = lane - local * self._paths
         state = mi.sample_tea_32(owner, number + self._seed * 0x9E3779B9)
         random = mi.PCG32(initstate=mi.UInt64(state[0]), initseq=mi.UInt64(state[1]))
-        # First directions of a point are stratified: a low-discrepancy sequence, shifted at random for each point.
+        # First directions of a point are stratified: a low-discrepancy sequence, shifted at random
+        # for each point.
         shift = [mi.sample_tea_float32(owner, self._seed * 2 + axis + 0x51ED27) for axis in (0, 1)]
         place = [s + (n := mi.Float64(number) * r) - dr.floor(n) for s, r in zip(shift, _PLASTIC)]
         place = mi.Point2f([mi.Float(x - dr.floor(x)) for x in place])
         normal = dr.gather(mi.Normal3f, self._normals, owner)
         origin = dr.gather(mi.Point3f, self._origins, owner)
         direction = mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(place))
-        scene, occluders, offset, most = self._scene, self._scene.occluders, self._offset, self._bounces
+        scene, occluders, offset, most = (
+            self._scene,
+            self._scene.occluders,
+            self._offset,
+            self._bounces,
+        )
 
         def step(origin, direction, throughput, reflections, active, random):
             ray = mi.Ray3f(origin, direction)
@@ -144,29 +168,45 @@ class PathSampler:
             going = hit & reflects & (reflections < most)
             throughput = dr.select(going, throughput * albedo, throughput)
             reflections = dr.select(going, reflections + 1, reflections)
-            likely = dr.select(reflections < ROULETTE_FROM, 1, dr.minimum(dr.max(throughput), MOST_LIKELY))
+            likely = dr.select(
+                reflections < ROULETTE_FROM, 1, dr.minimum(dr.max(throughput), MOST_LIKELY)
+            )
             going &= (random.next_float32(going) < likely) & (dr.max(throughput) > 0)
             throughput = dr.select(going, throughput / likely, throughput)
             place = mi.Point2f(random.next_float32(going), random.next_float32(going))
             onward = mi.Frame3f(normal.shading).to_world(mi.warp.square_to_cosine_hemisphere(place))
             origin = dr.select(going, si.p + offset * normal.geometric, origin)
             direction = dr.select(going, onward, direction)
-            reflections = dr.select(active & ~going & ~escaped, 0, reflections)  # what ends inside counts nothing
+            # what ends inside counts nothing
+            reflections = dr.select(active & ~going & ~escaped, 0, reflections)
             return origin, direction, throughput, reflections, going, random
 
-        state = origin, direction, dr.full(mi.Color3f, 1, width), dr.zeros(mi.UInt32, width), dr.full(mi.Bool, True, width), random
+        state = (
+            origin,
+            direction,
+            dr.full(mi.Color3f, 1, width),
+            dr.zeros(mi.UInt32, width),
+            dr.full(mi.Bool, True, width),
+            random,
+        )
         names = ("origin", "direction", "throughput", "reflections", "active", "random")
         state = dr.while_loop(state, lambda *s: s[4], step, labels=names)
         _, direction, throughput, reflections, _, _ = state
         dr.eval(direction, throughput, reflections)
-        direction, throughput = (np.stack([np.array(x) for x in values], axis=-1) for values in (direction, throughput))
+        direction, throughput = (
+            np.stack([np.array(x) for x in values], axis=-1) for values in (direction, throughput)
+        )
         return direction, throughput, np.array(reflections)
 
 
 def energies(escapes, paths):
-    """Irradiance (b, 64) in units of π under a uniform sky of radiance 1 after 1…64 reflections, mean of the channels."""
+    """Irradiance (b, 64) in units of π under a uniform sky of radiance 1 after 1…64 reflections,
+    mean of the channels.
+    """
     cell, throughput, reflections = escapes
     row, path = np.nonzero(cell != NOTHING)
     bin_ = np.minimum(reflections[row, path], ENERGY_BINS) - 1
     carried = throughput[row, path].mean(axis=1) / paths
-    return np.bincount(row * ENERGY_BINS + bin_, carried, len(cell) * ENERGY_BINS).reshape(len(cell), ENERGY_BINS)
+    return np.bincount(row * ENERGY_BINS + bin_, carried, len(cell) * ENERGY_BINS).reshape(
+        len(cell), ENERGY_BINS
+    )

@@ -1,12 +1,15 @@
-"""Direct-to-indirect transfer between clusters (Meshless PRT, section 4.3), solved in the coefficients of direct light.
+"""Direct-to-indirect transfer between clusters (Meshless PRT, section 4.3), solved in the
+coefficients of direct light.
 
-Light on a cluster s is taken as ℓ_s = P_s E_s, d coefficients of its irradiance, and stands for the pattern Q_s ℓ_s of which P_s is the
-left inverse. One hop from there to the points of a cluster r is Z_rs = A_rs Q_s, gathered by the rays of the receivers: signs of Q do not
-matter there (erratum 7). What arrives is light on r in turn, B_rs = P_r Z_rs, so that all reflections are the solution of a small dense
-system, ℓ + Bℓ + B²ℓ + … = (1 − B)⁻¹ ℓ, and indirect irradiance is E_r = Σ_s Z_rs [(1 − B)⁻¹ ℓ]_s: the series S − 1 of erratum 6.
-No matrix of points × points is formed.
+Light on a cluster s is taken as ℓ_s = P_s E_s, d coefficients of its irradiance, and stands for the
+pattern Q_s ℓ_s of which P_s is the left inverse. One hop from there to the points of a cluster r is
+Z_rs = A_rs Q_s, gathered by the rays of the receivers: signs of Q do not matter there (erratum 7).
+What arrives is light on r in turn, B_rs = P_r Z_rs, so that all reflections are the solution of a
+small dense system, ℓ + Bℓ + B²ℓ + … = (1 − B)⁻¹ ℓ, and indirect irradiance is E_r = Σ_s Z_rs [(1 −
+B)⁻¹ ℓ]_s: the series S − 1 of erratum 6. No matrix of points × points is formed.
 
-The basis is not centred: response is linear in light, and of intensity zero or a million alike (erratum 5).
+The basis is not centred: response is linear in light, and of intensity zero or a million alike
+(erratum 5).
 """
 
 from dataclasses import dataclass
@@ -44,8 +47,9 @@ class SenderBasis:
 def fit_senders(examples, importance, clusters, count, seed=0):
     """The patterns of example light on each cluster that matter most for what it causes.
 
-    Of all ranks d, P and Q leave the least squared error of importance · (E − Q P E) over the examples: they are the singular vectors of
-    importance · E, P = Uᵀ·importance and Q = E·V/σ. With the identity for importance that is the paper's PCA of direct light.
+    Of all ranks d, P and Q leave the least squared error of importance · (E − Q P E) over the
+    examples: they are the singular vectors of importance · E, P = Uᵀ·importance and Q = E·V/σ. With
+    the identity for importance that is the paper's PCA of direct light.
 
     Parameters
     ----------
@@ -85,14 +89,16 @@ def fit_senders(examples, importance, clusters, count, seed=0):
 
 
 def all_reflections(hop, bounces=None):
-    """The operator that takes coefficients of direct light to those of light after any number of reflections, direct light included.
+    """The operator that takes coefficients of direct light to those of light after any number of
+    reflections, direct light included.
 
     Parameters
     ----------
     hop : (k, k, channels) float64
         B.
     bounces : int or None
-        Most reflections until light arrives at a receiver, the last one included: 1 is light reflected once. None for all.
+        Most reflections until light arrives at a receiver, the last one included: 1 is light
+        reflected once. None for all.
 
     Returns
     -------
@@ -109,7 +115,10 @@ def all_reflections(hop, bounces=None):
         one = hop[..., channel]
         if bounces is None:
             if _spectral_radius(one) >= MOST_REFLECTIONS:
-                raise SceneError("light that is reflected grows without bound: lower the albedo, or ask for a number of bounces")
+                raise SceneError(
+                    "light that is reflected grows without bound: lower the albedo, or ask for a"
+                    " number of bounces"
+                )
             result[..., channel] = np.linalg.inv(np.eye(size) - one)
             continue
         total = np.eye(size)
@@ -121,7 +130,8 @@ def all_reflections(hop, bounces=None):
 
 def _spectral_radius(matrix):
     """About the largest modulus of the eigenvalues, by powers: ‖Bᵏv‖^(1/k) ends there."""
-    vector = np.random.default_rng(0).standard_normal(len(matrix))  # any that no symmetry of the matrix can take to zero
+    # any that no symmetry of the matrix can take to zero
+    vector = np.random.default_rng(0).standard_normal(len(matrix))
     growth = []
     for _ in range(_POWER_STEPS):
         vector = matrix @ vector
