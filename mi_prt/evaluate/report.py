@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..output.export import write_displayed, write_image
+from ..render.image_file import write_displayed, write_image
 from ..render.display import LUMINANCE, display
 from . import metrics
 

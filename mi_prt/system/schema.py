@@ -1,6 +1,6 @@
 """What the arrays of a file must be: one `Array` for each name. Checked before anything is read."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 
 @dataclass(frozen=True)
@@ -27,3 +27,18 @@ class Array:
     below: int | float | str | None = None
     optional: bool = False
     unit: str = ""
+
+    @property
+    def symbols(self):
+        """Names of numbers in it."""
+        return [x for x in (*self.shape, self.least, self.below) if isinstance(x, str)]
+
+    def renamed(self, names):
+        """The same with other names for some numbers, {old: new}."""
+        shape = tuple(_new(side, names) for side in self.shape)
+        least, below = _new(self.least, names), _new(self.below, names)
+        return replace(self, shape=shape, least=least, below=below)
+
+
+def _new(side, names):
+    return names.get(side, side) if isinstance(side, str) else side
