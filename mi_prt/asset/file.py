@@ -7,32 +7,32 @@ from pathlib import Path
 from ..errors import AssetError, SettingsError
 from ..points.layout import LAYOUTS
 from ..points.points import Points
-from ..system.schema import Flag, ListOf, MapOf, Plain, Record, Text, check
+from ..system.schema import Anything, Flag, ListOf, MapOf, Record, Text, check
 from ..transport.transport import TRANSPORTS
 from . import container
 
 _TEXTS = ("scene", "settings", "versions", "report")
-_EMITTER = Record({"name": Text, "kind": Text, "distant": Flag})
+_EMITTER = Record({"name": Text(), "kind": Text(), "distant": Flag()})
 _HEADER = Record(
     {
         "scene": Record(
             {
-                "kind": Text,
-                "path": Plain,
-                "parameters": MapOf(Text),
-                "hash": Text,
-                "appearance": Text,
-                "left_out": ListOf(MapOf(Plain)),
+                "kind": Text(),
+                "path": Anything(),
+                "parameters": MapOf(Text()),
+                "hash": Text(),
+                "appearance": Text(),
+                "left_out": ListOf(MapOf(Anything())),
             }
         ),
-        "settings": MapOf(Plain),
-        "versions": MapOf(Text),
-        "report": MapOf(Plain),
+        "settings": MapOf(Anything()),
+        "versions": MapOf(Text()),
+        "report": MapOf(Anything()),
         "emitters": ListOf(_EMITTER),
         "points": Record(
-            {"layout": Text, "surfaces": ListOf(MapOf(Plain)), "report": MapOf(Plain)}
+            {"layout": Text(), "surfaces": ListOf(MapOf(Anything())), "report": MapOf(Anything())}
         ),
-        "transports": MapOf(MapOf(Plain)),
+        "transports": MapOf(MapOf(Anything())),
     }
 )
 
@@ -134,6 +134,5 @@ def _schema(header):
         transport = TRANSPORTS[kind]
         check(part, transport.header_spec(), f"transports.{kind}")
         for name, array in transport.shapes(part).items():
-            names = {side: f"{kind} {side}" for side in array.symbols if side != "n"}
-            schema[f"transports/{kind}/{name}"] = array.renamed(names)
+            schema[f"transports/{kind}/{name}"] = array.within(kind, shared=("n",))
     return layout, schema

@@ -10,7 +10,7 @@ from ..directions import parse_directions
 from ..errors import SettingsError
 from ..lighting.emission import emission_of
 from ..lighting.local import arrival, hull_warning
-from ..system.schema import Flag, MapOf, Plain, Record, Text
+from ..system.schema import Anything, Flag, MapOf, Record, Text
 from .ledger import Entry
 from .transport import TRANSPORTS, Transport
 
@@ -187,7 +187,12 @@ class DistantTransport(Transport):
     def header_spec(cls):
         """See `Transport.header_spec`."""
         return Record(
-            {"directions": Text, "basis": Text, "keeps_direct": Flag, "report": MapOf(Plain)}
+            {
+                "directions": Text(),
+                "basis": Text(),
+                "keeps_direct": Flag(),
+                "report": MapOf(Anything()),
+            }
         )
 
     @classmethod

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..errors import LightError
 from ..system.parallel import one_blas_thread
-from ..system.schema import Array, ListOf, MapOf, OneOf, Plain, Record, Text
+from ..system.schema import Anything, Array, ListOf, MapOf, Record, Text
 from .ledger import Entry
 from .transport import TRANSPORTS, Transport
 
@@ -118,12 +118,12 @@ class OwnTransport(Transport):
     @classmethod
     def header_spec(cls):
         """See `Transport.header_spec`."""
-        lamp = Record({"name": Text, "kind": Text, "digest": Text, "strength": Plain})
+        lamp = Record({"name": Text(), "kind": Text(), "digest": Text(), "strength": Anything()})
         return Record(
             {
                 "lamps": ListOf(lamp),
-                "quantize": OneOf("16", "none"),
-                "report": MapOf(Plain),
+                "quantize": Text("16", "none"),
+                "report": MapOf(Anything()),
             }
         )
 
