@@ -142,8 +142,8 @@ class Asset:
 
     @property
     def components(self):
-        """Components of light that can be asked for."""
-        return COMPONENTS
+        """Components of light that all transports tell apart."""
+        return [c for c in COMPONENTS if all(c in t.components for t in self.transports.values())]
 
     # --- relighting ---------------------------------------------------------------------------
 

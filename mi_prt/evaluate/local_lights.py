@@ -2,6 +2,7 @@
 
 import warnings
 
+from ..errors import SceneError
 from ..lighting.environment import LightWarning
 from ..lighting.to_mitsuba import lit_scene
 from ..transport.transport import Question
@@ -65,3 +66,35 @@ def measure_error(asset, light, nearest, scene, seed=0):
         )
         warnings.warn(f"{warning}: {measured}", LightWarning, stacklevel=3)
     return error
+
+
+def stand_in_error(asset, light, nearest, open_scene, seed=0):
+    """The entry local_light_error{…} where transport of distant light stands in for local lights;
+    nothing where it does not, or where the scene is not to be had (with a warning).
+
+    Parameters
+    ----------
+    asset : Asset
+    light : Light
+        Resolved.
+    nearest : int
+    open_scene : callable() returning Scene or None
+        None where it is not worth to open it.
+    seed : int
+    """
+    shares = asset.shared_out(light)
+    local = shares["distant"].local if "distant" in shares else None
+    if local is None or local.is_empty:
+        return {}
+    found = asset.warnings(shares)
+    try:
+        scene = open_scene()
+        if scene is None:
+            return {}
+        return {"local_light_error": measure_error(asset, local, nearest, scene, seed)}
+    except SceneError as error:
+        warning = f"{found[0]}; by" if found else "local lights: by"
+        warnings.warn(
+            f"{warning} how much it errs cannot be measured: {error}", LightWarning, stacklevel=3
+        )
+        return {}

@@ -1,12 +1,9 @@
 """From an asset and light to a file: image, mesh with vertex radiance, or plain arrays."""
 
 import time
-import warnings
 
 from ..asset.provenance import open_scene_of
-from ..errors import SceneError
-from ..evaluate.local_lights import measure_error
-from ..lighting.environment import LightWarning
+from ..evaluate.local_lights import stand_in_error
 from ..render.display import exposure
 from ..render.picture import RENDERERS, Picture
 from ..system.files import check_writable
@@ -98,24 +95,10 @@ def relight_to_file(
         "points": len(asset.points),
         "seconds": {name: round(b - a, 5) for name, a, b in seconds},
     }
-    return result | _stand_in_error(asset, resolved, nearest, opened, scene)
 
+    def at_hand():
+        """The scene where it is open already, or worth opening."""
+        wanted = asset.warnings(asset.shared_out(resolved))
+        return opened or (open_scene_of(asset, scene) if wanted else None)
 
-def _stand_in_error(asset, light, nearest, opened, scene):
-    """The entry local_light_error where transport of distant light stands in for local lights; none
-    where the scene is neither open nor needed, or not to be had.
-    """
-    shares = asset.shared_out(light)
-    found = asset.warnings(shares)
-    local = shares["distant"].local if "distant" in shares else None
-    if local is None or local.is_empty or (opened is None and not found):
-        return {}
-    try:
-        scene = opened or open_scene_of(asset, scene)
-        return {"local_light_error": measure_error(asset, local, nearest, scene)}
-    except SceneError as error:
-        warning = f"{found[0]}; by" if found else "local lights: by"
-        warnings.warn(
-            f"{warning} how much it errs cannot be measured: {error}", LightWarning, stacklevel=3
-        )
-        return {}
+    return result | stand_in_error(asset, resolved, nearest, at_hand)

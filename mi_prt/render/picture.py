@@ -48,9 +48,16 @@ class Picture:
 
     def at_points(self):
         """Irradiance (n, 3) of the component at the points."""
-        return self._answered(self._distant, self._component) + self._answered(
-            self._local, self._component
-        )
+        return self.component_at_points(self._component)
+
+    def component_at_points(self, component):
+        """Irradiance (n, 3) of another component at the points."""
+        return self._answered(self._distant, component) + self._answered(self._local, component)
+
+    def holds(self, component):
+        """Whether all transports that answer tell a component apart."""
+        kinds = {*self._distant, *self._local}
+        return all(component in self.asset.transports[kind].components for kind in kinds)
 
     def irradiance(self):
         """Irradiance (n, 3) that is interpolated between the points: what pixels do not compute."""

@@ -12,7 +12,7 @@ from ..lighting.emission import emission_of
 from ..lighting.local import arrival, hull_warning
 from ..system.schema import Anything, Flag, MapOf, Record, Text
 from .ledger import Entry
-from .transport import TRANSPORTS, Transport
+from .transport import COMPONENTS, TRANSPORTS, Transport
 
 
 @TRANSPORTS.register
@@ -60,6 +60,11 @@ class DistantTransport(Transport):
     def reflects(self):
         """Whether it holds reflected light."""
         return self.report["bounces"] != 0
+
+    @property
+    def components(self):
+        """All, or the total alone where direct light was not kept apart."""
+        return COMPONENTS if self.direct is not None or not self.reflects else ("total",)
 
     def respond(self, points, question):
         """See `Transport.respond`."""
@@ -128,7 +133,7 @@ class DistantTransport(Transport):
             "cells": len(self.directions),
             "basis": basis.kind,
             "coefficients": len(basis),
-            "components": ["total", "direct", "indirect"] if self._splits else ["total"],
+            "components": list(self.components),
             "bounces": self.report["bounces"],
             "captured_variance": self.report["captured_variance"],
             "relative_error": self.report["relative_error"],
@@ -141,10 +146,6 @@ class DistantTransport(Transport):
                 },
             },
         }
-
-    @property
-    def _splits(self):
-        return self.direct is not None or not self.reflects
 
     def ledger(self):
         """See `Transport.ledger`."""

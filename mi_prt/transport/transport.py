@@ -114,6 +114,11 @@ class Transport(ABC):
         return self.report.get("channels", 1)
 
     @property
+    def components(self):
+        """Components that it tells apart."""
+        return COMPONENTS
+
+    @property
     @abstractmethod
     def reflects(self):
         """Whether it holds reflected light."""
