@@ -207,6 +207,24 @@ def torus(
     return vertex, split_quads(grid_faces(across + 1, around + 1)[:, ::-1], vertex[:, :3])
 
 
+def lampshade(
+    narrow: float = 0.7, around: int = 48, along: int = 4
+) -> tuple[np.ndarray, np.ndarray]:
+    """An open conical frustum round the y axis, from radius 1 at y = 0 to radius `narrow` at y = 1:
+    vertices (n, 8) = x y z nx ny nz u v, and faces (m, 3), facing outwards.
+
+    Vertices on the one seam of the texture exist twice, as in the torus.
+    """
+    grid = np.meshgrid(np.arange(along + 1) / along, np.arange(around + 1) / around, indexing="ij")
+    v, u = (a.ravel() for a in grid)
+    ring, radius = 2 * np.pi * (u % 1.0), 1.0 - (1.0 - narrow) * v
+    slope = np.full_like(ring, 1.0 - narrow)
+    normal = np.column_stack([np.cos(ring), slope, np.sin(ring)]) / np.hypot(1.0, 1.0 - narrow)
+    position = np.column_stack([radius * np.cos(ring), v, radius * np.sin(ring)])
+    vertex = np.round(np.column_stack([position, normal, u, v]), 7) + 0.0
+    return vertex, split_quads(grid_faces(along + 1, around + 1)[:, ::-1], vertex[:, :3])
+
+
 def write_ply(path: Path, vertex: np.ndarray, face: np.ndarray, comment: str) -> None:
     """Write a binary little-endian PLY: float32 x y z nx ny nz u v, and triangles as uchar + 3
     int32.
@@ -309,6 +327,19 @@ def sky_evening() -> np.ndarray:
     )
 
 
+def sky_morning() -> np.ndarray:
+    """A bright hazy sky with a warm sun 36 degrees up, for a room that it lights through a window."""
+    return sky(
+        elevation=36.0,
+        zenith=(1.5, 2.2, 3.6),
+        horizon=(4.2, 4.6, 5.0),
+        ground=(1.3, 1.25, 1.0),
+        glow=(2.6, 2.2, 1.5),
+        sun=(850.0, 720.0, 530.0),
+        sun_width=3.0,
+    )
+
+
 def write_exr(path: Path, image: np.ndarray) -> None:
     """Write linear RGB of shape (rows, columns, 3) as a half-float OpenEXR file with ZIP
     compression.
@@ -384,6 +415,8 @@ def generate(out: Path = HERE) -> list[Path]:
         "Utah teapot, tessellated from the Bezier patches of M. Newell",
     )
     write_ply(out / "meshes/torus.ply", *torus(), "torus")
+    write_ply(out / "meshes/lampshade.ply", *lampshade(), "lampshade")
+    write_exr(out / "textures/sky_morning.exr", sky_morning())
     write_exr(out / "textures/sky_noon.exr", sky_noon())
     write_exr(out / "textures/sky_evening.exr", sky_evening())
     write_png(out / "textures/planks.png", planks())
