@@ -4,7 +4,7 @@ import sys
 import time
 import warnings
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import Annotated
 
 import typer
 
@@ -103,7 +103,7 @@ def precompute(
         typer.Option("--resume", help="Continue an interrupted run of this file, if there is one."),
     ] = False,
     max_memory: Annotated[
-        Optional[str],
+        str | None,
         typer.Option(
             "--max-memory", metavar="BYTES", help="Such as 3G; default: half of what is free."
         ),
@@ -183,7 +183,7 @@ def relight(
     component: Component = "total",
     direct: Direct = "points",
     light_path: Annotated[
-        Optional[str],
+        str | None,
         typer.Option(
             "--light-path",
             metavar="'x,y,z x,y,z …'",

@@ -3,7 +3,7 @@
 import inspect
 from functools import wraps
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import Annotated
 
 import typer
 
@@ -25,20 +25,20 @@ Json = Annotated[
     bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else.")
 ]
 Threads = Annotated[
-    Optional[int], typer.Option("--threads", metavar="N", help="CPU threads; default: all cores.")
+    int | None, typer.Option("--threads", metavar="N", help="CPU threads; default: all cores.")
 ]
 Define = Annotated[
-    Optional[list[str]],
+    list[str] | None,
     typer.Option("-D", metavar="NAME=VALUE", help="Value for a <default> parameter of the XML."),
 ]
 Environment = Annotated[
-    Optional[Path],
+    Path | None,
     typer.Option(
         "--envmap", metavar="EXR", help="Environment map; default: the scene's own light."
     ),
 ]
 Lights = Annotated[
-    Optional[list[str]],
+    list[str] | None,
     typer.Option(
         "--light",
         metavar="SPEC",
@@ -66,18 +66,18 @@ Nearest = Annotated[
     ),
 ]
 Rotate = Annotated[
-    Optional[str],
+    str | None,
     typer.Option(
         "--rotate", metavar="AXIS:DEGREES", help="Turn distant light about x, y, z or a,b,c."
     ),
 ]
 OtherScene = Annotated[
-    Optional[Path],
+    Path | None,
     typer.Option("--scene", metavar="SCENE", help="The asset's scene, if it is elsewhere by now."),
 ]
 Sensor = Annotated[int, typer.Option("--sensor", help="Index of the scene's sensor.")]
 Size = Annotated[
-    Optional[str], typer.Option("--size", metavar="WxH", help="Image size; default: the sensor's.")
+    str | None, typer.Option("--size", metavar="WxH", help="Image size; default: the sensor's.")
 ]
 Seed = Annotated[int, typer.Option("--seed", help="Same seed, same result.")]
 
@@ -109,9 +109,9 @@ def _parameter(option):
     rest = {"help": option.help + default, "rich_help_panel": _PANELS[option.group]}
     if isinstance(option, Flag):
         kind = typer.Option(f"{flag}/--no-{flag[2:]}", show_default=False, **rest)
-        annotation = Annotated[Optional[bool], kind]
+        annotation = Annotated[bool | None, kind]
     else:
-        annotation = Annotated[Optional[str], typer.Option(flag, metavar=option.metavar, **rest)]
+        annotation = Annotated[str | None, typer.Option(flag, metavar=option.metavar, **rest)]
     return inspect.Parameter(
         option.name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation
     )

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..render.image_file import write_displayed, write_image
 from ..render.display import LUMINANCE, display
+from ..render.image_file import write_displayed, write_image
 from . import metrics
 
 _PAGE = """<!doctype html>

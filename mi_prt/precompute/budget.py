@@ -8,7 +8,7 @@ from ..errors import SettingsError
 from ..system.memory import resident_bytes
 from ..system.parallel import BLOCK_ROWS
 from ..system.runtime import thread_count
-from ..transport.direct import LANES
+from ..transport.bits import LANES
 from ..transport.interreflection import COLUMNS
 from .reflections import GREY, MOST_RAYS
 

@@ -62,6 +62,8 @@ class DistantBuilder(Builder):
         with closing(self._rows(sampler)) as bits:
             job.trace("transport", sampler, bits)
             self._dark = sampler.transport(bits).dark()
+        if not job.points.layout.buries:
+            return np.zeros(len(job.points), bool)
         return find_buried(job.scene, job.points, self._dark, lanes)
 
     def _rows(self, sampler):

@@ -5,6 +5,8 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from typing import ClassVar
 
+import numpy as np
+
 from ..system.registry import Registry
 from ..transport.bits import find_buried
 
@@ -36,6 +38,8 @@ class Job:
     points : Points
     clusters : Clusters or None
         Where a transport asks for them.
+    flights : (k, 2, 3) float32 or None
+        Of particles, where points were found by them.
     progress : callable(stage, done, total, detail)
     limit : int
         Bytes that the process may have resident.
@@ -50,6 +54,7 @@ class Job:
     settings: object
     points: object
     clusters: object
+    flights: object
     progress: object
     limit: int
     clock: Clock = field(default_factory=Clock)
@@ -116,7 +121,10 @@ class Builder(ABC):
 
     def buried(self):
         """Which points (n,) are buried, once the run has begun; asked of the first builder."""
-        return find_buried(self.job.scene, self.job.points)
+        points = self.job.points
+        if not points.layout.buries:
+            return np.zeros(len(points), bool)
+        return find_buried(self.job.scene, points, np.ones(len(points), bool))
 
     @abstractmethod
     def build(self):

@@ -3,6 +3,7 @@
 """
 
 import time
+from contextlib import closing
 from dataclasses import replace
 
 import numpy as np
@@ -43,7 +44,8 @@ class LocalBuilder(Builder):
         super().__init__(job)
         settings = job.settings
         self._clusters, self._slices = job.clusters, job.clusters.slices
-        self._places = example_places(job.scene, settings, job.points)
+        lights, seed = settings.example_lights, settings.seed
+        self._places = example_places(job.scene, lights, seed, job.flights)
         grey = np.ptp(job.points.albedo, axis=1).max(initial=0) <= GREY
         self._channels = 1 if grey else 3
         self._hemisphere = Hemisphere(settings.depth_directions)
@@ -131,7 +133,7 @@ class LocalBuilder(Builder):
         labels = clusters.labels
         count = self._flat_size(senders)
         started, traced, n = time.perf_counter(), 0, len(job.points)
-        with job.workspace.rows("clusters", len(self._slices), 4 * count) as rows:
+        with closing(job.workspace.rows("clusters", len(self._slices), 4 * count)) as rows:
             for number, cluster in enumerate(self._slices):
                 if number >= rows.filled:
                     part = self._cluster(tracer, labels, senders, number, count)
@@ -241,7 +243,7 @@ class LocalBuilder(Builder):
         matrix, ranks, error = within_budget(matrix, examples, settings.transfer_error)
         rank = max(int(ranks.max()), 1)
         receivers = np.concatenate([part["receivers"][:, :rank] for part in parts])
-        receivers *= np.arange(rank) < ranks[self._clusters.labels_in_order][:, None]
+        receivers *= np.arange(rank) < ranks[self._clusters.labels][:, None]
         matrix = np.ascontiguousarray(matrix[:, :rank])
         job.progress("transfer", 1, 1, "")
         entries = max(int(ranks.sum()) * k * channels, 1)
@@ -288,7 +290,8 @@ class LocalBuilder(Builder):
         job = self.job
         index = np.random.default_rng(job.settings.seed).permutation(len(job.points))[:count]
         clusters = max(1, round(len(index) / job.settings.cluster_size))
-        points, made = make_clusters(job.points.at(np.sort(index)), clusters, job.settings.seed)
+        points = job.points.at(np.sort(index))
+        made = make_clusters(points, clusters, job.settings.seed)
         with temporary() as workspace:
             pilot = replace(
                 job,

@@ -139,9 +139,9 @@ def begin(scene, plan, progress, limit):
     """
     settings = plan.settings
     kinds = [BUILDERS[kind] for kind in plan.transports]
-    job = Job(scene, settings, None, None, progress, limit)
+    job = Job(scene, settings, None, None, None, progress, limit)
     job.clock.lap("scene")
-    job.points, job.clusters = make_points(
+    job.points, job.clusters, job.flights = make_points(
         scene, settings, any(kind.needs_clusters for kind in kinds), progress
     )
     job.clock.lap("points")
@@ -153,23 +153,47 @@ def begin(scene, plan, progress, limit):
 
 
 def make_points(scene, settings, clustered, progress):
-    """Points of a scene, and their clusters where these are asked for.
+    """Points of a scene.
+
+    Parameters
+    ----------
+    scene : Scene
+    settings : Settings
+        With the kind of points chosen.
+    clustered : bool
+        Whether clusters are asked for.
+    progress : callable(stage, done, total, detail)
 
     Returns
     -------
     points : Points
     clusters : Clusters or None
+    flights : (k, 2, 3) float32 or None
+        Of particles that were traced on the way.
     """
-    if settings.points == "vertices":
-        points = sample_points(scene, settings.edge_length)
-    else:
-        progress("samples", 0, settings.count, "")
-        points = scatter_points(scene, settings.count, settings.seed)
-        progress("samples", settings.count, settings.count, "")
-    if not clustered:
-        return points, None
-    count = max(1, round(len(points) / settings.cluster_size))
-    return make_clusters(points, count, settings.seed)
+    return POINT_KINDS[settings.points](scene, settings, clustered, progress)
+
+
+def _vertices(scene, settings, clustered, progress):
+    points = sample_points(scene, settings.edge_length)
+    count = _cluster_count(len(points), settings)
+    clusters = make_clusters(points, count, settings.seed) if clustered else None
+    return points, clusters, None
+
+
+def _samples(scene, settings, clustered, progress):
+    progress("samples", 0, settings.count, "")
+    clusters = _cluster_count(settings.count, settings)
+    found = scatter_points(scene, settings.count, clusters, settings.seed)
+    progress("samples", settings.count, settings.count, "")
+    return found
+
+
+def _cluster_count(points, settings):
+    return max(1, round(points / settings.cluster_size))
+
+
+POINT_KINDS = {"vertices": _vertices, "samples": _samples}
 
 
 def _identity(job):

@@ -160,22 +160,22 @@ OPTIONS = (
         "distant",
     ),
     # --- the scene's own lamps
-    Integer(
-        "lamp_samples",
-        1024,
-        "Most shadow rays from a point to a lamp; fewer where they suffice.",
-        "N",
+    Real(
+        "lamp_tolerance",
+        0.01,
+        "Noise of direct light of lamps that shadow rays stop at, relative.",
+        "SHARE",
         "own",
-        least=1,
-        most=MAX_PATHS,
+        least=1e-4,
+        below=1,
     ),
     Integer(
-        "lamp_paths",
-        512,
-        "Rays from each point for reflections of lamps.",
+        "lamp_rays",
+        256,
+        "Rays from each point for reflections of lamps: a multiple of 4.",
         "N",
         "own",
-        least=2,
+        least=4,
         most=MAX_PATHS,
     ),
     # --- lamps that move
@@ -247,6 +247,8 @@ class _Settings:
             raise SettingsError(
                 f"paths per point must be auto or an even number, got {self.paths_per_point}"
             )
+        if self.lamp_rays % 4:
+            raise SettingsError(f"lamp rays must be a multiple of 4, got {self.lamp_rays}")
         Hemisphere(self.depth_directions)
         self._check_coefficients()
         if not BASES[self.basis].holds_reflections and self.bounces not in (None, 0):
