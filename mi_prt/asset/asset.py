@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from ..lighting.environment import LightWarning
-from ..lighting.light import as_light
-from ..lighting.local import arrival, hull_warning, refuse_all_but_point_lights
+from ..lighting.emission import emission_of
+from ..lighting.light import Light, as_light
+from ..lighting.local import arrival, hull_warning
 from ..points.interpolate import PatchInterpolator
 from ..points.points import Points
 from ..system.parallel import BLOCK_ROWS, map_chunks, one_blas_thread
@@ -61,20 +62,15 @@ class Asset:
         Parameters
         ----------
         light : Light or what `as_light` accepts
-            Point lights in it are left aside: at each point they are another light.
+            Local lights in it are left aside: at each point they are another light.
 
         Returns
         -------
         coefficients : (d, 3) float32
         mean_response : (3,) float32
 
-        Raises
-        ------
-        LightError
-            If there are local lights other than point lights.
         """
         light = as_light(light)
-        refuse_all_but_point_lights(light)
         return self.basis.project(light.distant, self.directions)
 
     def prepare_light(self, light):
@@ -133,12 +129,13 @@ class Asset:
             infinity.
         """
         light = as_light(light)
-        warning = hull_warning(light.point_lights, self.points.hull) if light.point_lights else None
+        places = emission_of(light).positions
+        warning = hull_warning(places, self.points.hull) if len(places) else None
         if warning:
             warnings.warn(warning, LightWarning, stacklevel=2)
-        return self.irradiance_from(*self.project_light(light), light.point_lights, nearest)
+        return self.irradiance_from(*self.project_light(light), light, nearest)
 
-    def irradiance_from(self, coefficients, mean_response, point_lights=(), nearest=1):
+    def irradiance_from(self, coefficients, mean_response, light=Light(), nearest=1):
         """Irradiance (n, 3) from distant light that is projected already, c·ℓ + m (Eigentransport
         eq. 10, mean kept exactly), and local lights.
 
@@ -152,29 +149,35 @@ class Asset:
             else:
                 irradiance = self.coefficients @ coefficients
         irradiance += mean_response
-        for light in point_lights:
-            irradiance += self._arriving(light, nearest)
+        for arriving in self._arriving(light, nearest):
+            irradiance += arriving
         return np.maximum(irradiance, 0, out=irradiance)
 
-    def local_irradiance(self, point_lights, nearest=1):
+    def local_irradiance(self, light, nearest=1):
         """Irradiance (n, 3) float32 in W/m² by local lights alone, wherever they are; see
         `irradiance`.
         """
         none = np.zeros((len(self.points), 3), np.float32)
-        return np.maximum(sum((self._arriving(light, nearest) for light in point_lights), none), 0)
+        return np.maximum(sum(self._arriving(as_light(light), nearest), none), 0)
 
     def _arriving(self, light, nearest):
-        """Response (n, 3) to a local light: the transport of the directions it is seen in times
-        I/r² (eq. 4, erratum 3).
+        """Responses (n, 3) to the places of local light: the transport of the directions each is
+        seen in times I/r² (eq. 4, erratum 3).
         """
-        cells, irradiance = arrival(light, self.points.positions, self.directions, nearest)
+        for cells, irradiance in arrival(
+            emission_of(light), self.points.positions, self.directions, nearest
+        ):
+            seen = self._seen(cells)
+            yield irradiance * (seen if seen.ndim == 2 else seen[:, None])
+
+    def _seen(self, cells):
+        """Mean transport of all points in their cells (n, k)."""
 
         def transport(first):
             block = slice(first, first + BLOCK_ROWS)
             return self.basis.at(self.coefficients[block], cells[block]).mean(axis=1)
 
-        seen = np.concatenate(list(map_chunks(transport, range(0, len(self.points), BLOCK_ROWS))))
-        return irradiance * (seen if seen.ndim == 2 else seen[:, None])
+        return np.concatenate(list(map_chunks(transport, range(0, len(self.points), BLOCK_ROWS))))
 
     def relight(self, light, nearest=1):
         """Outgoing radiance B = ρ/π · E at the points, (n, 3) float32 in W/(m²·sr).

@@ -13,11 +13,16 @@ from ..asset.meshless_asset import MeshlessAsset
 from ..asset.provenance import open_scene_of
 from ..errors import SettingsError
 from ..lighting.emission import emission_of
-from ..lighting.scene_light import chosen_local_light, lit_scene, turned_light
+from ..lighting.to_mitsuba import lit_scene
 from ..render.display import display, exposure
 from ..render.image import coverage, pick_sensor, render_image, resized
 from . import ground_truth, metrics
-from .local_lights import measure_error
+from .local_lights import (
+    distant_and_given,
+    local_and_given,
+    measure_error,
+    with_own_lamps,
+)
 from .report import write_report
 
 REFERENCES = ("modelled", "full")
@@ -173,8 +178,11 @@ class _Case:
 
 
 def _under_distant_light(asset, opened, light, rotate, reference, nearest, seed):
-    shown, chosen_light = turned_light(opened, light, rotate)
-    truth = lit_scene(opened.modelled() if reference == "modelled" else opened.mi_scene, shown)
+    chosen_light = distant_and_given(opened, light, rotate)
+    if reference == "modelled":
+        truth = lit_scene(opened, chosen_light, modelled=True)
+    else:
+        truth = lit_scene(opened, with_own_lamps(opened, chosen_light))
 
     def told(*_):
         any_number = asset.reference_bounces is None
@@ -189,16 +197,16 @@ def _under_distant_light(asset, opened, light, rotate, reference, nearest, seed)
             "indirect_noise": asset.report.get("indirect_noise", 0.0),
             "captured_variance": asset.report["captured_variance"],
         }
-        if chosen_light.point_lights:
+        if not chosen_light.local.is_empty:
             report["local_light_error"] = measure_error(
-                asset, chosen_light.point_lights, nearest, opened, seed
+                asset, chosen_light.local, nearest, opened, seed
             )
         return report
 
     return _Case(
         truth,
         lambda: asset.irradiance_from(
-            *asset.project_light(chosen_light), chosen_light.point_lights, nearest
+            *asset.project_light(chosen_light), chosen_light, nearest
         ),
         lambda camera, irradiance: render_image(
             asset, truth, camera, IMAGE_SAMPLES, seed, irradiance
@@ -208,11 +216,8 @@ def _under_distant_light(asset, opened, light, rotate, reference, nearest, seed)
 
 
 def _under_local_lights(asset, opened, light, reference, direct, seed):
-    shown, keep_local, chosen_light = chosen_local_light(opened, light)
-    as_written = opened.mi_scene if keep_local else opened.unlit()
-    truth = lit_scene(
-        opened.modelled(keep_local) if reference == "modelled" else as_written, shown, keep_local
-    )
+    chosen_light = local_and_given(opened, light)
+    truth = lit_scene(opened, chosen_light, modelled=reference == "modelled")
 
     def told(chosen, truth_direct, truth_indirect):
         components = {"direct": truth_direct, "indirect": truth_indirect}

@@ -7,10 +7,12 @@ from pathlib import Path
 from ..asset.meshless_asset import MeshlessAsset
 from ..asset.provenance import open_scene_of
 from ..errors import SceneError, SettingsError
-from ..evaluate.local_lights import measure_error
+from ..evaluate.local_lights import distant_and_given, measure_error, with_own_lamps
+from ..lighting.emission import emission_of
 from ..lighting.environment import LightWarning
 from ..lighting.local import hull_warning
-from ..lighting.scene_light import is_of_scene, lit_scene, turned_light
+from ..lighting.light import as_light
+from ..lighting.to_mitsuba import lit_scene
 from ..render.display import exposure
 from ..render.image import pick_sensor, render_image, resized
 from ..scene.scene import Scene
@@ -103,16 +105,16 @@ def relight_to_file(
         raise SettingsError(f"renderer '{renderer}' is not known: use {' or '.join(RENDERERS)}")
     check_writable(output)
 
-    needs_scene = suffix in IMAGES or is_of_scene(light)
+    needs_scene = suffix in IMAGES or (light is None or as_light(light).of_scene)
     opened = open_scene_of(asset, scene) if needs_scene else None
-    shown, chosen = turned_light(opened, light, rotate)
+    chosen = distant_and_given(opened, light, rotate)
     if renderer == "raster":
         from ..render.raster import RasterScene  # opens OpenGL: only where it is asked for
 
     clock = [time.perf_counter()]
     projected = asset.project_light(chosen)
     clock.append(time.perf_counter())
-    irradiance = asset.irradiance_from(*projected, chosen.point_lights, nearest)
+    irradiance = asset.irradiance_from(*projected, chosen, nearest)
     radiance = asset.outgoing_radiance(irradiance)
     clock.append(time.perf_counter())
     if suffix == ".ply":
@@ -121,7 +123,7 @@ def relight_to_file(
         write_npz(output, asset, radiance, irradiance)
     else:
         factor = exposure(radiance[~asset.buried])
-        lit = Scene(lit_scene(opened.mi_scene, shown), opened.source)
+        lit = Scene(lit_scene(opened, with_own_lamps(opened, chosen)), opened.source)
         with resized(pick_sensor(lit.mi_scene, sensor), size) as camera:
             if renderer == "raster":
                 with RasterScene(asset, lit, camera) as raster:
@@ -135,8 +137,8 @@ def relight_to_file(
         "points": len(asset.points),
         "seconds": {name: round(b - a, 5) for name, a, b in stages},
     }
-    if chosen.point_lights:
-        result |= _local_light_error(asset, chosen.point_lights, nearest, opened, scene)
+    if not chosen.local.is_empty:
+        result |= _local_light_error(asset, chosen.local, nearest, opened, scene)
     return result
 
 
@@ -144,7 +146,7 @@ def _local_light_error(asset, lights, nearest, opened, scene):
     """The entry local_light_error, or none where the scene is neither open nor needed, or not to be
     had.
     """
-    warning = hull_warning(lights, asset.points.hull)
+    warning = hull_warning(emission_of(lights).positions, asset.points.hull)
     if opened is None and not warning:
         return {}
     try:

@@ -2,7 +2,6 @@
 
 import time
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +9,10 @@ import numpy as np
 from ..asset.meshless_asset import COMPONENTS
 from ..asset.provenance import open_scene_of
 from ..errors import LightError, SettingsError
+from ..evaluate.local_lights import local_and_given
 from ..lighting.emission import emission_of
 from ..lighting.light import Light, as_light
-from ..lighting.scene_light import chosen_local_light, is_of_scene, lit_scene
+from ..lighting.to_mitsuba import lit_scene
 from ..render.display import display, exposure
 from ..render.image import pick_sensor, render_image, resized
 from ..render.integrator import DIRECT
@@ -48,7 +48,7 @@ def relight_local(
     _check(component, direct, renderer)
     started = time.perf_counter()
     if suffix in MESHES:
-        if light is not None and is_of_scene(light):
+        if light is not None and as_light(light).of_scene:
             light = _named(asset, light)
         irradiance = asset.irradiance(light, component)
         relit = time.perf_counter()
@@ -154,7 +154,7 @@ class LocalPicture:
     asset : MeshlessAsset
     opened : Scene
         The asset's.
-    light : what `chosen_local_light` takes
+    light : what `resolve` takes
     component, direct : str
     """
 
@@ -165,7 +165,7 @@ class LocalPicture:
 
     def move(self, light):
         """Take another light."""
-        self._shown, self._keep_local, self._chosen = chosen_local_light(self._opened, light)
+        self._chosen = local_and_given(self._opened, light)
 
     def at_points(self):
         """Irradiance (n, 3) of the component at the points."""
@@ -181,8 +181,7 @@ class LocalPicture:
 
     def lit(self):
         """The Scene as it is seen: under its lights, without distant ones."""
-        shapes = self._opened.mi_scene if self._keep_local else self._opened.unlit()
-        return Scene(lit_scene(shapes, self._shown, self._keep_local), self._opened.source)
+        return Scene(lit_scene(self._opened, self._chosen), self._opened.source)
 
     @contextmanager
     def drawn(self, sensor, size, renderer, spp, samples=2):
@@ -229,28 +228,21 @@ def _check(component, direct, renderer):
 
 def _named(asset, light):
     """A light in which 'scene' is the emission that the asset holds."""
-    parts = light if isinstance(light, list | tuple) else [light]
-    return as_light([asset.emission() if is_of_scene(part) else part for part in parts])
-
-
-_PLACES = {"point_lights": "position", "spot_lights": "position", "area_lights": "centre"}
+    return Light(asset.emission() if part.of_scene else part for part in as_light(light).parts)
 
 
 def _moving(light):
     """A function from a place to a light whose first one is there."""
-    light = as_light(light) if light is not None else Light()
-    kind = next((kind for kind in _PLACES if getattr(light, kind)), None)
-    if kind is None:
+    parts = as_light(light).parts if light is not None else ()
+    number = next((i for i, part in enumerate(parts) if part.is_movable), None)
+    if number is None:
         raise LightError(
             "a light path moves the first point, spot or area light that is given: pass one"
             " (--light point:0,0,0:r,g,b)"
         )
-    first, *others = getattr(light, kind)
-    return lambda place: replace(
-        light, **{kind: (replace(first, **{_PLACES[kind]: place}), *others)}
-    )
+    before, first, after = parts[:number], parts[number], parts[number + 1 :]
+    return lambda place: Light((*before, first.moved(place), *after))
 
 
 def _moves_a_shape(light):
-    light = as_light(light)
-    return not (light.point_lights or light.spot_lights)
+    return next(part for part in as_light(light).parts if part.is_movable).is_shape

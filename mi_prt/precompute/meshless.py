@@ -18,7 +18,7 @@ from ..errors import LightError, SettingsError
 from ..lighting.emission import emission_of
 from ..lighting.light import Light, as_light
 from ..lighting.local_emitters import local_scene_light
-from ..lighting.local_lights import PointLight
+from ..lighting.point import PointLight
 from ..points.samples import scatter_samples
 from ..system.memory import resident_bytes
 from ..system.parallel import map_chunks
