@@ -16,7 +16,7 @@ from conftest import diffuse, disk, emitted, rectangle, scene, sky_of, sphere
 
 import mi_prt
 from mi_prt.errors import SceneError, SettingsError
-from mi_prt.lighting.scene_light import scene_light
+from mi_prt.lighting.from_mitsuba import scene_light
 from mi_prt.points.interpolate import PatchInterpolator
 from mi_prt.points.points import sample_points
 from mi_prt.render.display import display, exposure
