@@ -209,7 +209,7 @@ class DistantTransport(Transport):
             shapes |= basis.coefficient_shapes(count)
             # each set has components of its own; directions are shared
             found |= {
-                f"{name}/{key}": a.renamed({"d": f"d of {name}"}) for key, a in shapes.items()
+                f"{name}/{key}": a.within(name, ("n", "s")) for key, a in shapes.items()
             }
         return found
 
