@@ -265,17 +265,22 @@ def fuzz(files, options):
 
     for first in range(min(options.workers, options.count)):
         begin(range(first, options.count, options.workers))
-    while selector.get_map():
-        for key, _ in selector.select(timeout=0.5):
-            lines = key.data.lines()
-            for line in lines or ():
-                _record(key.data, line, tally)
-            if lines is None:
-                selector.unregister(key.data.pipe)
-                begin(_after_end(key.data, tally))
+    try:
+        while selector.get_map():
+            for key, _ in selector.select(timeout=0.5):
+                lines = key.data.lines()
+                for line in lines or ():
+                    _record(key.data, line, tally)
+                if lines is None:
+                    selector.unregister(key.data.pipe)
+                    begin(_after_end(key.data, tally))
+            for key in list(selector.get_map().values()):
+                if key.data.current and time.monotonic() - key.data.since > options.seconds + 1:
+                    os.kill(key.data.id, signal.SIGKILL)
+    finally:  # after an error workers are left
         for key in list(selector.get_map().values()):
-            if key.data.current and time.monotonic() - key.data.since > options.seconds + 1:
-                os.kill(key.data.id, signal.SIGKILL)
+            os.kill(key.data.id, signal.SIGKILL)
+            key.data.close()
     return tally
 
 
