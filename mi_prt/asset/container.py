@@ -101,7 +101,7 @@ def _dtype(array):
 def _head(path, header, arrays):
     """Length and header in bytes, filled up with blanks."""
     end = 0
-    table = {
+    table: dict[str, dict] = {
         "__metadata__": {
             "format": FORMAT,
             "format_version": str(FORMAT_VERSION),
@@ -277,7 +277,7 @@ class Stored:
 class _Data:
     """The bytes of all arrays: those of `buffer` from `first` on."""
 
-    buffer: object
+    buffer: mmap.mmap
     first: int
 
     def __len__(self):
