@@ -126,8 +126,10 @@ class LampRays:
 
     def _gather(self, met, first, size):
         """Irradiance (2, 3, b, k) after one reflection, by either half of the rays."""
-        sums = self._of_each(met, first, size) if self._aimed is None else self._of_chosen(
-            met, first, size
+        sums = (
+            self._of_each(met, first, size)
+            if self._aimed is None
+            else self._of_chosen(met, first, size)
         )
         return sums * np.float32(2 / self._rays)
 
