@@ -49,6 +49,10 @@ class Registry(Mapping):
 
         return register
 
+    def restore(self, kinds):
+        """Hold these kinds, a dict by name, and no others; for tests of what is registered."""
+        self._kinds = dict(kinds)
+
     def __getitem__(self, name):
         """The kind of a name.
 
