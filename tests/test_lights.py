@@ -247,8 +247,7 @@ def test_sampled_reference_of_many_lights_is_unbiased_and_knows_its_noise():
         PointLight([-3, 1, 1], 3.0),
     ]
     alone = [
-        ground_truth.point_irradiance(lit_scene(opened, part), points, 1 << 14, 3)
-        for part in parts
+        ground_truth.point_irradiance(lit_scene(opened, part), points, 1 << 14, 3) for part in parts
     ]
     expected = sum(reference.mean for reference in alone)
     together = ground_truth.point_irradiance(lit_scene(opened, parts), points, 256, 4)
@@ -314,7 +313,9 @@ def test_irradiance_of_a_sum_is_the_sum_of_irradiances(box):
         parts[5],
     ]
     light = as_light(nested)
-    assert [part.kind for part in light.parts] == ["envmap"] * 2 + ["directional"] * 2 + ["point"] * 2
+    assert [part.kind for part in light.parts] == ["envmap"] * 2 + ["directional"] * 2 + [
+        "point"
+    ] * 2
     expected = sum(box.irradiance(part).astype(np.float64) for part in parts)
     np.testing.assert_allclose(
         box.irradiance(nested), expected, rtol=1e-5, atol=1e-6 * expected.max()

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..lighting.environment import LightWarning
 from ..lighting.emission import emission_of
+from ..lighting.environment import LightWarning
 from ..lighting.light import Light, as_light
 from ..lighting.local import arrival, hull_warning
 from ..points.interpolate import PatchInterpolator

@@ -205,9 +205,7 @@ def _under_distant_light(asset, opened, light, rotate, reference, nearest, seed)
 
     return _Case(
         truth,
-        lambda: asset.irradiance_from(
-            *asset.project_light(chosen_light), chosen_light, nearest
-        ),
+        lambda: asset.irradiance_from(*asset.project_light(chosen_light), chosen_light, nearest),
         lambda camera, irradiance: render_image(
             asset, truth, camera, IMAGE_SAMPLES, seed, irradiance
         ),

@@ -94,9 +94,7 @@ class Emission(LocalPart):
 
     def scaled(self, factor):
         """See `LightPart.scaled`."""
-        return Emission(
-            **self.exact | {"intensity": self.exact["intensity"] * rgb_factor(factor)}
-        )
+        return Emission(**self.exact | {"intensity": self.exact["intensity"] * rgb_factor(factor)})
 
     def to_mitsuba(self):
         """Refused: see `LightPart.to_mitsuba`.

@@ -92,8 +92,10 @@ class SpotLight(LocalPart):
     def to_mitsuba(self):
         """See `LightPart.to_mitsuba`."""
         aside = np.eye(3)[np.argmin(np.abs(self.direction))]
-        to_world = mitsuba().ScalarTransform4f().look_at(
-            list(self.position), list(self.position + self.direction), list(aside)
+        to_world = (
+            mitsuba()
+            .ScalarTransform4f()
+            .look_at(list(self.position), list(self.position + self.direction), list(aside))
         )
         return {
             "type": "spot",

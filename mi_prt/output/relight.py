@@ -10,8 +10,8 @@ from ..errors import SceneError, SettingsError
 from ..evaluate.local_lights import distant_and_given, measure_error, with_own_lamps
 from ..lighting.emission import emission_of
 from ..lighting.environment import LightWarning
-from ..lighting.local import hull_warning
 from ..lighting.light import as_light
+from ..lighting.local import hull_warning
 from ..lighting.to_mitsuba import lit_scene
 from ..render.display import exposure
 from ..render.image import pick_sensor, render_image, resized

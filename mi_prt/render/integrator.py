@@ -8,9 +8,9 @@ from ..asset.meshless_asset import MeshlessAsset
 from ..asset.opening import load
 from ..errors import InputError, SettingsError
 from ..lighting.emission import emission_of
+from ..lighting.from_mitsuba import scene_light
 from ..lighting.local_emitters import local_scene_light
 from ..lighting.places import Places
-from ..lighting.from_mitsuba import scene_light
 from ..scene.materials import reflectance_at
 from ..scene.scene import Scene, SceneSource
 from ..scene.traversal import digest_of

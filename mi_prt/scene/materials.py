@@ -11,6 +11,7 @@ from ..system.runtime import mitsuba
 from .models import MATERIALS, black
 from .traversal import children
 
+
 @dataclass(frozen=True, eq=False)
 class Material:
     """A BSDF and its diffuse model.

@@ -58,9 +58,7 @@ class OwnLight:
         the light changes by `strength` alone.
         """
         strength = self._strength_key()
-        kept = digest_of(
-            [self.emitter], lambda key: key not in ("sampling_weight", strength)
-        )
+        kept = digest_of([self.emitter], lambda key: key not in ("sampling_weight", strength))
         if self.shape is not None:
             kept += digest_of([self.shape], lambda key: "." not in key)
         return hashlib.sha256(kept.encode()).hexdigest()

@@ -13,7 +13,7 @@ from ..errors import SceneError
 from ..system.runtime import a_worker_at_least, mitsuba
 from .own_lights import list_own_lights
 from .rebuild import check_can_be_copied, kept_parts, rebuilt_scene
-from .surface import Surface, list_surfaces
+from .surface import list_surfaces
 from .traversal import children, digest_of
 
 

@@ -26,6 +26,4 @@ rough_plastic = _coated("RoughPlastic", "diffuse_reflectance", "glossy coat")
 principled = _coated(
     "Principled", "base_color", "specular, sheen, clearcoat and transmission lobes"
 )
-principled_thin = _coated(
-    "PrincipledThin", "base_color", "specular, sheen and transmission lobes"
-)
+principled_thin = _coated("PrincipledThin", "base_color", "specular, sheen and transmission lobes")
