@@ -30,8 +30,8 @@ from mi_prt.directions import Cubemap
 from mi_prt.evaluate import metrics
 from mi_prt.evaluate.ground_truth import image, point_irradiance
 from mi_prt.lighting.cells import cell_radiance
-from mi_prt.lighting.lattice import on_lattice
 from mi_prt.lighting.from_mitsuba import scene_light
+from mi_prt.lighting.lattice import on_lattice
 from mi_prt.lighting.to_mitsuba import lit_scene
 from mi_prt.points.points import sample_points
 from mi_prt.precompute.info import storage_bytes
@@ -546,9 +546,7 @@ def local_lights(assets, pictures):
     chosen = np.sort(np.random.default_rng(0).permutation(len(pca.points))[:4000])
     for height in (20.0, 8.0, 4.0, 2.5, 1.6, 1.1, 0.6):
         light = mi_prt.PointLight((1.2, height, 0.8), 100.0)
-        truth = point_irradiance(
-            lit_scene(sampled.scene, light), pca.points.at(chosen), 1
-        ).mean
+        truth = point_irradiance(lit_scene(sampled.scene, light), pca.points.at(chosen), 1).mean
         results = pca.irradiance(light), pca.irradiance(light, nearest=4), none.irradiance(light)
         figures = [
             f(result[chosen], truth)

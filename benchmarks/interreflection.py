@@ -286,9 +286,7 @@ def _against_mitsuba(scene, asset, seconds):
     paths = 64
     errors, spent = [], 0.0
     for direction in directions.vectors[few]:
-        lit = lit_scene(
-            scene, mi_prt.DirectionalLight(direction=-direction, irradiance=(1, 1, 1))
-        )
+        lit = lit_scene(scene, mi_prt.DirectionalLight(direction=-direction, irradiance=(1, 1, 1)))
         # compiles
         ground_truth.indirect_irradiance(lit, asset.points.at(np.arange(64)), paths, BOUNCES)
         started = time.perf_counter()

@@ -291,8 +291,7 @@ def test_distant_assets_refuse_components(tmp_path):
     distant = mi_prt.precompute(flat, directions="cubemap:4", coefficients=1)
     with pytest.raises(SettingsError, match="points='samples'"):
         relight_to_file(distant, tmp_path / "a.npz", component="indirect", scene=flat)
-    with pytest.raises(LightError, match="points='samples'"):
-        distant.irradiance(mi_prt.SpotLight((0, 1, 0), (0, -1, 0), 1.0))
+    assert distant.irradiance(mi_prt.SpotLight((0, 1, 0), (0, -1, 0), 1.0)).any()
 
 
 def test_films_without_a_light_to_move_are_refused(asset, tmp_path):
