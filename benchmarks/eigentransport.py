@@ -67,10 +67,12 @@ def main():
 
 HEAD = """# The Eigentransport paper, measured
 
-Made by `benchmarks/eigentransport.py` on two CPU cores. Paper: Nowrouzezahrai, Simari, Kalogerakis, Fiume: *Eigentransport for Efficient
-and Accurate All-Frequency Relighting* (2007); figure and section numbers are the paper's. Directions are `cubemap:32` (6,144) unless
-said otherwise. Errors of transport are ‖T − T̂‖/‖T‖ over the fitted rows (at most 20,000 points that see the sky, picked at random), in the
-norm of the sphere: each direction weighs its solid angle. Meshes have a largest extent of 2 m; planes are 8 m wide."""
+Made by `benchmarks/eigentransport.py` on two CPU cores. Paper: Nowrouzezahrai, Simari,
+Kalogerakis, Fiume: *Eigentransport for Efficient and Accurate All-Frequency Relighting* (2007);
+figure and section numbers are the paper's. Directions are `cubemap:32` (6,144) unless said
+otherwise. Errors of transport are ‖T − T̂‖/‖T‖ over the fitted rows (at most 20,000 points that
+see the sky, picked at random), in the norm of the sphere: each direction weighs its solid angle.
+Meshes have a largest extent of 2 m; planes are 8 m wide."""
 
 
 # --- scenes and transport -------------------------------------------------------------------------

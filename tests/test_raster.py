@@ -420,7 +420,9 @@ PROGRAM = """
 import sys, numpy as np
 from test_raster import diffuse, linear, opened, rectangle, sphere
 scene, asset, sensor = opened(
-    floor=rectangle(bsdf=diffuse([0.2, 0.5, 0.8])), ball=sphere(radius=0.5, bsdf=diffuse()), sky={"type": "constant"}
+    floor=rectangle(bsdf=diffuse([0.2, 0.5, 0.8])),
+    ball=sphere(radius=0.5, bsdf=diffuse()),
+    sky={"type": "constant"},
 )
 np.save(sys.argv[1], linear(asset, scene, sensor, asset.irradiance(None)))
 """

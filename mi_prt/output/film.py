@@ -217,7 +217,8 @@ def _write_mp4(path, images, fps):
         codec.colorspace, codec.color_range = Colorspace.ITU709, ColorRange.MPEG
         codec.color_primaries, codec.color_trc = ColorPrimaries.BT709, ColorTrc.IEC61966_2_1
         count = 0
-        for count, image in enumerate(chain([first], map(to_8bit, images)), 1):
+        for image in chain([first], map(to_8bit, images)):
+            count += 1
             image = np.pad(
                 image,
                 [(0, height - image.shape[0]), (0, width - image.shape[1]), (0, 0)],
@@ -254,7 +255,8 @@ def _write_gif(path, images, fps):
         stream = file.add_stream("gif", rate=fps)
         stream.width, stream.height, stream.pix_fmt = width, height, "pal8"
         count = 0
-        for count, image in enumerate(chain([first], map(to_8bit, images)), 1):
+        for image in chain([first], map(to_8bit, images)):
+            count += 1
             frame = av.VideoFrame.from_ndarray(image, format="rgb24")
             frame.pts, frame.time_base = count - 1, 1 / fps
             graph.push(frame)
