@@ -27,7 +27,7 @@ from mi_prt.lighting.scene_light import lit_scene
 from mi_prt.points.points import sample_points
 from mi_prt.scene.scene import open_scene
 from mi_prt.system.runtime import mitsuba
-from mi_prt.transport.direct import sample_direct
+from mi_prt.transport.bits import sample_direct
 
 ASSETS = Path(__file__).resolve().parents[2] / "shared" / "assets"
 COEFFICIENTS = (48, 192)

@@ -38,7 +38,7 @@ from mi_prt.render.display import display, exposure
 from mi_prt.render.image import coverage, pick_sensor, render_image, resized
 from mi_prt.scene.scene import open_scene
 from mi_prt.system.runtime import mitsuba
-from mi_prt.transport.direct import sample_direct
+from mi_prt.transport.bits import sample_direct
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

@@ -12,7 +12,7 @@ from mi_prt.directions import parse_directions
 from mi_prt.points.points import sample_points
 from mi_prt.scene.scene import open_scene
 from mi_prt.system.runtime import mitsuba
-from mi_prt.transport.direct import find_buried, sample_direct
+from mi_prt.transport.bits import find_buried, sample_direct
 from mi_prt.transport.hops import NOTHING, Hops, HopSampler, blocked_share
 from mi_prt.transport.interreflection import solve, split_by_bounces
 from mi_prt.transport.paths import PathSampler

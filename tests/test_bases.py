@@ -19,7 +19,7 @@ from mi_prt.lighting.lattice import on_lattice
 from mi_prt.lighting.scene_light import lit_scene
 from mi_prt.precompute.info import describe, describe_asset
 from mi_prt.scene.scene import open_scene
-from mi_prt.transport.direct import sample_direct
+from mi_prt.transport.bits import sample_direct
 
 PARTS = dict(
     floor=rectangle(size=2, bsdf=diffuse(0.6)),

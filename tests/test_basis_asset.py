@@ -17,7 +17,7 @@ import threadpoolctl
 from conftest import bias, cube, diffuse, disk, rectangle, relative_l2, scene, sphere, uniform_sky
 
 import mi_prt
-import mi_prt.transport.direct
+import mi_prt.transport.bits
 from mi_prt import AssetError, SettingsError
 from mi_prt.basis import pca
 from mi_prt.basis.pca import fit_pca
@@ -29,7 +29,7 @@ from mi_prt.precompute import budget as room
 from mi_prt.precompute.precompute import measure
 from mi_prt.scene.scene import open_scene
 from mi_prt.system.runtime import mitsuba
-from mi_prt.transport.direct import sample_direct
+from mi_prt.transport.bits import sample_direct
 
 mi = mitsuba()
 

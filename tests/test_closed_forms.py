@@ -30,7 +30,7 @@ from mi_prt.lighting.cells import cell_radiance
 from mi_prt.lighting.scene_light import scene_light
 from mi_prt.scene.scene import open_scene
 from mi_prt.system.runtime import mitsuba
-from mi_prt.transport.direct import sample_direct
+from mi_prt.transport.bits import sample_direct
 
 mi = mitsuba()
 

@@ -1,4 +1,4 @@
-"""The asset: everything that relighting needs."""
+"""The asset: points, and transports of light to them."""
 
 import warnings
 from dataclasses import dataclass, field
@@ -7,80 +7,87 @@ from pathlib import Path
 
 import numpy as np
 
+from ..errors import LightError
 from ..lighting.environment import LightWarning
-from ..lighting.light import as_light
-from ..lighting.local import arrival, hull_warning, refuse_all_but_point_lights
-from ..points.interpolate import PatchInterpolator
+from ..lighting.light import Light, as_light
+from ..lighting.own_light import SceneLight, resolve
 from ..points.points import Points
-from ..system.parallel import BLOCK_ROWS, map_chunks, one_blas_thread
-from . import asset_file
+from ..transport.transport import COMPONENTS, TRANSPORTS, Question
+from . import file
+from .provenance import open_scene_of
 
 
 @dataclass(frozen=True, eq=False)
 class Asset:
-    """A scene's precomputed transport.
+    """A scene's precomputed transport: everything that relighting needs.
 
     Parameters
     ----------
     points : Points
-    buried : (n,) bool
-        Points inside or against other geometry; rendering takes their neighbours' light instead.
-    directions : DirectionLattice
-    basis : a basis of `basis.bases.BASES`
-    coefficients : (n, d) float32
-        An array, (n, 3, d) where reflections colour the light and the basis does not; a sparse
-        array for the basis `haar`; the sampled `DirectTransport` (n, s) for the basis `none`.
+    transports : dict
+        By kind: 'distant', 'own', 'local', those that there are.
+    emitters : tuple of dict
+        name, kind and `distant` (bool) of each emitter of the scene.
     scene : dict
-        kind, path, parameters, hash and left_out (what of the scene is not modelled).
+        kind, path, parameters, hash, appearance and left_out (what of the scene is not modelled).
     settings : dict
         What the run used.
     versions : dict
     report : dict
-        Counts from sampling (rays, dark and buried points), captured variance and relative error of
-        the transport, and how light splits by reflections (see `indirect`).
+        What was counted and measured, beside the reports of the transports.
     path : Path or None
         The file it was loaded from or saved to.
     """
 
     points: Points
-    buried: np.ndarray
-    directions: object
-    basis: object
-    coefficients: object
+    transports: dict
+    emitters: tuple
     scene: dict
     settings: dict
     versions: dict
     report: dict
     path: Path | None = field(default=None, compare=False)
 
-    # --- light ------------------------------------------------------------------------------------
+    # --- light --------------------------------------------------------------------------------
 
-    def project_light(self, light):
-        """Distant light in this asset's basis.
+    @property
+    def own_lights(self):
+        """The scene's own lights by name, each a part of light that can be dimmed:
+        `asset.own_lights["lamp_2"] * 0.3`.
+        """
+        return {emitter["name"]: SceneLight(emitter["name"]) for emitter in self.emitters}
+
+    def resolved(self, light=None, rotate=None, scene=None):
+        """Light with the scene's own in the place of 'scene'.
 
         Parameters
         ----------
-        light : Light or what `as_light` accepts
-            Point lights in it are left aside: at each point they are another light.
+        light : what `as_light` accepts, 'scene', or a list of these, optional
+            By default the scene's own light, all of it.
+        rotate : (axis, degrees), optional
+            Turns the distant light.
+        scene : Scene, path, dict or mi.Scene, optional
+            Needed where the light contains distant light of the scene, and only then opened; by
+            default where it was.
 
         Returns
         -------
-        coefficients : (d, 3) float32
-        mean_response : (3,) float32
+        Light
 
         Raises
         ------
         LightError
-            If there are local lights other than point lights.
+            If the scene has no light of a name, or none at all.
+        SceneError
+            If the scene is needed and not to be had.
         """
-        light = as_light(light)
-        refuse_all_but_point_lights(light)
-        return self.basis.project(light.distant, self.directions)
+        light = as_light(SceneLight() if light is None else light)
+        if light.of_scene:
+            light = resolve(light, self.emitters, lambda: open_scene_of(self, scene))
+        return light if rotate is None else light.rotated(*rotate)
 
-    def prepare_light(self, light):
+    def prepare_light(self, light=None, scene=None):
         """The same light in a form that turns in milliseconds.
-
-        Maps are kept on a fine lattice; spherical harmonics turn them in closed form.
 
         >>> sky = asset.prepare_light("sky.exr")
         >>> for degrees in range(360):
@@ -88,100 +95,113 @@ class Asset:
 
         Parameters
         ----------
-        light : Light or what `as_light` accepts
+        light, scene :
+            As of `resolved`.
 
         Returns
         -------
         Light
         """
-        return self.basis.prepare(as_light(light), self.directions)
+        light = self.resolved(light, scene=scene)
+        for transport in self.transports.values():
+            light = transport.prepare(light)
+        return light
 
-    @property
-    def channels(self):
-        """Colour channels of transport: 3 where reflections colour the light, else 1."""
-        return self.report.get("channels", 1)
-
-    @cached_property
-    def _channels_apart(self):
-        """Whether each channel has coefficients of its own."""
-        return isinstance(self.coefficients, np.ndarray) and self.coefficients.ndim == 3
-
-    @property
-    def reference_bounces(self):
-        """Reflections that the truth has: as many as were asked for; None, any number, where that
-        was left to the scene.
-        """
-        bounces = self.settings["bounces"]
-        return None if bounces == "auto" else bounces
-
-    # --- relighting -------------------------------------------------------------------------------
-
-    def irradiance(self, light, nearest=1):
-        """Irradiance at the points, (n, 3) float32 in W/m².
+    def shared_out(self, light):
+        """Which transport answers for which part of light.
 
         Parameters
         ----------
-        light : Light or what `as_light` accepts
-            Any number of environment maps, directional and local lights; their irradiances add up.
+        light : Light
+            Resolved.
+
+        Returns
+        -------
+        dict
+            Light by the kind of transport.
+
+        Raises
+        ------
+        LightError
+            If no transport takes a part.
+        """
+        found = {}
+        for part in light.parts:
+            transports = [t for t in self.transports.values() if t.takes(part)]
+            transports += [t for t in self.transports.values() if t.stands_in_for(part)]
+            if not transports:
+                held = "; ".join(f"{k} ({t.takes_words})" for k, t in self.transports.items())
+                wanted = [k for k, t in TRANSPORTS.items() if t.is_for(part)]
+                raise LightError(
+                    f"{part.words} is light that this asset holds no transport for; it holds"
+                    f" {held}: precompute the scene again with transports"
+                    f" {','.join([*self.transports, *wanted])} (--transports)"
+                )
+            found.setdefault(transports[0].kind, []).append(part)
+        return {kind: Light(tuple(parts)) for kind, parts in found.items()}
+
+    @property
+    def components(self):
+        """Components of light that all transports tell apart."""
+        return [c for c in COMPONENTS if all(c in t.components for t in self.transports.values())]
+
+    # --- relighting ---------------------------------------------------------------------------
+
+    def irradiance(self, light=None, component="total", nearest=1):
+        """Irradiance at the points.
+
+        Parameters
+        ----------
+        light : what `as_light` accepts, 'scene', or a list of these, optional
+            Any number of environment maps, directional and local lights and lights of the scene;
+            their irradiances add up. By default the scene's own light.
+        component : 'total', 'direct' or 'indirect'
         nearest : int
-            Directions that stand for a local light (Eigentransport, section 4.2.1).
+            Directions that stand for a local light where transport is for distant light only
+            (Eigentransport, section 4.2.1).
+
+        Returns
+        -------
+        (n, 3) float32
+            W/m².
+
+        Raises
+        ------
+        LightError
+            If no transport takes a light.
+        SettingsError
+            If the component is another, or not there for distant light (see `keep_direct`).
 
         Warns
         -----
         LightWarning
-            If a local light is inside the convex hull of the scene: transport holds visibility to
-            infinity.
+            If a local light stands in the convex hull of the scene and only transport of distant
+            light is there to answer for it: that holds visibility to infinity.
         """
-        light = as_light(light)
-        warning = hull_warning(light.point_lights, self.points.hull) if light.point_lights else None
-        if warning:
+        shares = self.shared_out(self.resolved(light))
+        for warning in self.warnings(shares):
             warnings.warn(warning, LightWarning, stacklevel=2)
-        return self.irradiance_from(*self.project_light(light), light.point_lights, nearest)
+        return self.answered(shares, component, nearest)
 
-    def irradiance_from(self, coefficients, mean_response, point_lights=(), nearest=1):
-        """Irradiance (n, 3) from distant light that is projected already, c·ℓ + m (Eigentransport
-        eq. 10, mean kept exactly), and local lights.
+    def warnings(self, shares):
+        """What there is to say of light shared out: a list of texts."""
+        found = (self.transports[kind].check(self.points, light) for kind, light in shares.items())
+        return [warning for warning in found if warning]
 
-        What compression leaves of the sum below zero is zero.
-        """
-        with one_blas_thread():
-            if self._channels_apart:
-                irradiance = np.matmul(self.coefficients.swapaxes(0, 1), coefficients.T[..., None])[
-                    ..., 0
-                ].T
-            else:
-                irradiance = self.coefficients @ coefficients
-        irradiance += mean_response
-        for light in point_lights:
-            irradiance += self._arriving(light, nearest)
-        return np.maximum(irradiance, 0, out=irradiance)
+    def answered(self, shares, component="total", nearest=1):
+        """Irradiance (n, 3) float32 under light shared out, without warnings; see `irradiance`."""
+        Question(Light(()), component)
+        total = np.zeros((len(self.points), 3), np.float32)
+        for kind, light in shares.items():
+            question = Question(light, component, nearest)
+            total += self.transports[kind].respond(self.points, question)
+        return total
 
-    def local_irradiance(self, point_lights, nearest=1):
-        """Irradiance (n, 3) float32 in W/m² by local lights alone, wherever they are; see
+    def relight(self, light=None, component="total", nearest=1):
+        """Outgoing radiance B = ρ/π · E at the points, (n, 3) float32 in W/(m²·sr); see
         `irradiance`.
         """
-        none = np.zeros((len(self.points), 3), np.float32)
-        return np.maximum(sum((self._arriving(light, nearest) for light in point_lights), none), 0)
-
-    def _arriving(self, light, nearest):
-        """Response (n, 3) to a local light: the transport of the directions it is seen in times
-        I/r² (eq. 4, erratum 3).
-        """
-        cells, irradiance = arrival(light, self.points.positions, self.directions, nearest)
-
-        def transport(first):
-            block = slice(first, first + BLOCK_ROWS)
-            return self.basis.at(self.coefficients[block], cells[block]).mean(axis=1)
-
-        seen = np.concatenate(list(map_chunks(transport, range(0, len(self.points), BLOCK_ROWS))))
-        return irradiance * (seen if seen.ndim == 2 else seen[:, None])
-
-    def relight(self, light, nearest=1):
-        """Outgoing radiance B = ρ/π · E at the points, (n, 3) float32 in W/(m²·sr).
-
-        See `irradiance`.
-        """
-        return self.outgoing_radiance(self.irradiance(light, nearest))
+        return self.outgoing_radiance(self.irradiance(light, component, nearest))
 
     def outgoing_radiance(self, irradiance):
         """Outgoing radiance B = ρ/π · E (n, 3) of irradiance (n, 3) at the points."""
@@ -191,20 +211,36 @@ class Asset:
     def _reflection(self):
         return self.points.albedo * np.float32(1 / np.pi)
 
-    def transport(self, rows):
-        """Transport (len(rows), s) float32 as the basis reconstructs it, or (len(rows), 3, s);
-        `rows` indexes points.
+    # --- what it holds ------------------------------------------------------------------------
+
+    @property
+    def buried(self):
+        """Points inside or against other geometry, (n,) bool; rendering takes their neighbours'
+        light instead.
         """
-        return self.basis.reconstruct(self.coefficients[rows])
+        return self.points.buried
 
-    def interpolator(self, scene):
-        """What gives irradiance between the points at hits on a Scene, a PatchInterpolator."""
-        return PatchInterpolator(scene, self.points, self.buried)
+    @property
+    def reflects(self):
+        """Whether any transport holds reflected light."""
+        return any(t.reflects for t in self.transports.values())
 
-    # --- file -------------------------------------------------------------------------------------
+    @property
+    def reference_bounces(self):
+        """Reflections that the truth has: as many as were asked for; None is any number."""
+        bounces = self.settings["bounces"]
+        if bounces is None:  # the default: as many as it takes, of what holds reflections
+            return None if self.reflects or "distant" not in self.transports else 0
+        return None if bounces == "auto" else bounces
+
+    def ledger(self):
+        """What is known of the asset's errors, a list of `Entry`."""
+        return [entry for t in self.transports.values() for entry in t.ledger()]
+
+    # --- file ---------------------------------------------------------------------------------
 
     def save(self, path, folder=None):
-        """Write the asset to one file, all or nothing; see `asset_file`.
+        """Write the asset to one file, all or nothing.
 
         Parameters
         ----------
@@ -218,5 +254,25 @@ class Asset:
         SettingsError
             If the path cannot be written.
         """
-        asset_file.write(self, path, folder)
+        file.write(self, path, folder)
         object.__setattr__(self, "path", Path(path).absolute())
+
+
+def load(path):
+    """Open an asset.
+
+    Parameters
+    ----------
+    path : path
+
+    Returns
+    -------
+    Asset
+
+    Raises
+    ------
+    AssetError
+        If the file is missing, damaged, no asset, or of a format version that this program does
+        not know.
+    """
+    return Asset(**file.read(path))

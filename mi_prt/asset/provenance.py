@@ -1,15 +1,15 @@
 """The tie between an asset and the scene it came from."""
 
 import warnings
+from collections import Counter
 from pathlib import Path
 
 from ..errors import SceneError
 from ..lighting.environment import LightWarning
-from ..points.tessellate import TESSELLATED_SHAPES
 from ..scene.scene import open_scene
 
 
-def describe_scene(scene, local_lights=False):
+def describe_scene(scene, points, transports):
     """What an asset records of its scene: kind, path, parameters, hash, appearance, left_out (which
     see).
     """
@@ -20,25 +20,25 @@ def describe_scene(scene, local_lights=False):
         "parameters": source.parameters,
         "hash": scene.hash,
         "appearance": scene.appearance,
-        "left_out": left_out(scene, local_lights),
+        "left_out": left_out(scene, points, transports),
     }
 
 
-def left_out(scene, local_lights=False):
-    """What of a scene the transport does not model, in words, one entry for each kind.
+def left_out(scene, points, transports):
+    """What of a scene an asset does not model, in words, one entry for each kind.
 
     Parameters
     ----------
     scene : Scene
-    local_lights : bool
-        Whether the transport is that of local lights, at samples on any shape, or that of distant
-        light, at vertices.
+    points : Points
+    transports : collection of str
+        Kinds of transport that the asset has.
 
     Returns
     -------
     list of dict
         what, shapes (names), share (part of the light at 45° that those materials scatter in the
-        way that is left out; None where it cannot be told).
+        way that is left out; None where it cannot be found out).
     """
     by_material = {}
     for surface in scene.surfaces:
@@ -48,23 +48,28 @@ def left_out(scene, local_lights=False):
         {"what": what, "shapes": names, "share": round(material.left_out_albedo(), 3)}
         for (material, what), names in by_material.items()
     ]
+    for surface in points.surfaces:
+        if surface.get("patches") == 0:
+            what = f"{surface['kind']}: blocks light but reflects none"
+            entries.append({"what": what, "shapes": [surface["name"]], "share": None})
     for surface in scene.surfaces:
-        if surface.kind not in TESSELLATED_SHAPES and not local_lights:
-            what = f"{surface.kind}: blocks light but reflects none"
-            entries.append({"what": what, "shapes": [surface.name], "share": None})
         if surface.shape.interior_medium() or surface.shape.exterior_medium():
-            entries.append(
-                {"what": "participating medium", "shapes": [surface.name], "share": None}
-            )
-    lamps = {}
-    for emitter in scene.distant_emitters if local_lights else scene.local_emitters:
-        lamps[emitter.class_name()] = lamps.get(emitter.class_name(), 0) + 1
-    where = "distant" if local_lights else "local"
-    for kind, count in lamps.items():
-        entries.append(
-            {"what": f"{kind}: light of {count} {where} emitters", "shapes": [], "share": None}
-        )
-    return entries
+            what = "participating medium"
+            entries.append({"what": what, "shapes": [surface.name], "share": None})
+    return entries + _lights_left_out(scene, transports)
+
+
+def _lights_left_out(scene, transports):
+    counts = Counter()
+    held = {True: "distant" in transports, False: "own" in transports or "local" in transports}
+    for emitters, distant in ((scene.distant_emitters, True), (scene.local_emitters, False)):
+        if not held[distant]:
+            where = "distant" if distant else "local"
+            counts.update((emitter.class_name(), where) for emitter in emitters)
+    return [
+        {"what": f"{kind}: light of {count} {where} emitters", "shapes": [], "share": None}
+        for (kind, where), count in counts.items()
+    ]
 
 
 def open_scene_of(asset, scene=None, parameters=None):
@@ -99,6 +104,7 @@ def open_scene_of(asset, scene=None, parameters=None):
                 f"the asset came from a scene {recorded['kind']} in memory: pass the scene"
                 " (--scene)"
             )
+        _check_place(recorded["path"])
         if not Path(recorded["path"]).is_file():
             raise SceneError(
                 f"the asset's scene '{recorded['path']}' is not there any more: pass its new path"
@@ -112,7 +118,7 @@ def open_scene_of(asset, scene=None, parameters=None):
             f"'{name}' is not the scene of the asset: its geometry or sidedness changed since it"
             " was precomputed; precompute it again, or pass the right one (--scene)"
         )
-    if asset.report["bounces"] and opened.appearance != recorded["appearance"]:
+    if asset.reflects and opened.appearance != recorded["appearance"]:
         warnings.warn(
             "the scene's materials changed since it was precomputed: light that they reflect onto"
             " other surfaces is still that of the old ones",
@@ -120,3 +126,14 @@ def open_scene_of(asset, scene=None, parameters=None):
             stacklevel=2,
         )
     return opened
+
+
+def _check_place(path):
+    """Refuse a recorded path that leads elsewhere than to a file of this machine."""
+    if path.startswith(("//", "\\\\")) or "\0" in path:
+        raise SceneError(
+            f"the asset's scene '{path}' is no file of this machine: pass it (--scene)"
+        )
+    place = Path(path)
+    if place.exists() and not place.is_file():
+        raise SceneError(f"the asset's scene '{path}' is no regular file: pass the scene (--scene)")

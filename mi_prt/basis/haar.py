@@ -22,15 +22,17 @@ import scipy.sparse
 
 from ..directions import MAX_CUBEMAP_RESOLUTION, Cubemap
 from ..errors import SettingsError
-from .basis import Basis
+from ..system.schema import Array
+from .basis import BASES, Basis, compute_anew
 from .linear import LinearBasis
-from .rows import Rows
+from .rows import Rows, encoded
 from .target import Fit, Target, centred, check_room, shares
 
 # for each wavelet of a shared set and direction: as a function, weighted, and to encode with
 FIT_BYTES = 12
 
 
+@BASES.register
 @dataclass(frozen=True, eq=False)
 class HaarBasis(Basis):
     """The k Haar wavelets of each transport row that matter most to it: the best approximation of
@@ -53,6 +55,68 @@ class HaarBasis(Basis):
 
     kind = "haar"
     ARRAYS = ("sqrt_weights", "captured_variance")
+    holds_reflections = False
+    work = (3, 0)
+    copies = 3.2  # indices are wider in memory
+
+    @classmethod
+    def fit(cls, rows, target, seed=0, progress=None, max_bytes=inf, keep=compute_anew):
+        """See `fit_haar`."""
+        return fit_haar(rows, target, seed, progress or _quiet, max_bytes)
+
+    @classmethod
+    def check(cls, directions, components):
+        """See `check_haar`."""
+        check_haar(directions, None if components == "auto" else components)
+
+    @classmethod
+    def coefficient_bytes(cls, points, directions, components, rays_per_direction=1):
+        """Each number with the index of its wavelet."""
+        return points * components * (6 if directions <= 1 << 16 else 8)
+
+    @classmethod
+    def light_bytes(cls, directions, components):
+        """Light in all wavelets."""
+        return 4 * directions
+
+    @classmethod
+    def projection_bytes(cls, directions, components):
+        """None: the transform is computed."""
+        return 0
+
+    @classmethod
+    def shapes(cls, channels):
+        """See `Basis.shapes`."""
+        return {
+            "sqrt_weights": Array("f4", ("s",), least=0, unit="sr^(1/2)"),
+            "captured_variance": Array("f8", ("d",)),
+        }
+
+    @classmethod
+    def coefficient_shapes(cls, channels):
+        """See `Basis.coefficient_shapes`."""
+        return {
+            "coefficients/indices": Array(("u2", "u4"), ("n", "d"), least=0, below="s"),
+            "coefficients/values": Array("f4", ("n", "d"), unit="sr^(1/2)"),
+        }
+
+    @classmethod
+    def pack(cls, coefficients):
+        """See `Basis.pack`."""
+        n, s = coefficients.shape
+        index = coefficients.indices.reshape(n, -1)
+        return {
+            "coefficients/indices": index.astype(np.uint16 if s <= 1 << 16 else np.uint32),
+            "coefficients/values": coefficients.data.reshape(n, -1),
+        }
+
+    @classmethod
+    def unpack(cls, arrays, normals, directions):
+        """See `Basis.unpack`."""
+        values, index = arrays["coefficients/values"], arrays["coefficients/indices"]
+        n, k = values.shape
+        entries = (values.ravel(), index.ravel().astype(np.int32), row_ends(n, k))
+        return scipy.sparse.csr_array(entries, shape=(n, directions))
 
     def __len__(self):
         """Number of coefficients of a row, k."""
@@ -78,6 +142,12 @@ class HaarBasis(Basis):
         ends = row_ends(count, len(self))
         return scipy.sparse.csr_array(
             (entries.ravel(), largest.ravel().astype(np.int32), ends), shape=(count, s)
+        )
+
+    def encode_all(self, transport, progress=None):
+        """A csr_array (n, s)."""
+        return encoded(
+            self.encode, transport, progress, lambda b: scipy.sparse.vstack(b, format="csr")
         )
 
     def reconstruct(self, coefficients):
@@ -114,12 +184,29 @@ class HaarBasis(Basis):
         return np.ascontiguousarray(coefficients.T), np.zeros(3, np.float32)
 
 
+@BASES.register
 class SharedHaarBasis(LinearBasis):
     """One set of Haar wavelets for all transport rows: those that carry the most energy of all rows
     together.
     """
 
     kind = "haar-shared"
+    work = (2, 1)
+
+    @classmethod
+    def fit(cls, rows, target, seed=0, progress=None, max_bytes=inf, keep=compute_anew):
+        """See `fit_haar_shared`."""
+        return fit_haar_shared(rows, target, seed, progress or _quiet, max_bytes)
+
+    @classmethod
+    def check(cls, directions, components):
+        """See `check_haar`."""
+        check_haar(directions, None if components == "auto" else components)
+
+    @classmethod
+    def fit_bytes(cls, points, directions, components):
+        """The wavelets as functions."""
+        return FIT_BYTES * components * directions
 
 
 class HaarTransform:
@@ -228,6 +315,10 @@ class HaarTransform:
 
 
 haar_transform = cache(HaarTransform)
+
+
+def _quiet(done, total):
+    """The progress of a fit that nobody follows."""
 
 
 def row_ends(rows, entries):

@@ -12,12 +12,14 @@ import scipy.linalg
 from ..errors import SettingsError
 from ..lighting.environment import rotation_matrix
 from ..lighting.light import Light
+from .basis import BASES, compute_anew
 from .linear import LinearBasis
 from .rows import Rows
 from .target import Fit, Target, centred, check_room, shares
 
 # 1,089 functions: far beyond what low-frequency light needs, and cheap to turn still
 MAX_BANDS = 33
+DEFAULT_HARMONICS = 49  # 7 bands
 FIRST_BANDS = 10  # where a search for a share of the variance starts
 FIT_BYTES = 32  # for each function and direction: in float64, made orthonormal, and in float32
 # of the functions' Gram matrix over a lattice's directions; 1 on the sphere
@@ -148,6 +150,7 @@ def rotate(coefficients, matrix):
     )
 
 
+@BASES.register
 class HarmonicBasis(LinearBasis):
     """Spherical harmonics (Sloan, Kautz and Snyder 2002), sampled in the directions of a lattice.
 
@@ -157,6 +160,27 @@ class HarmonicBasis(LinearBasis):
     """
 
     kind = "sh"
+    work = (1, 2)
+
+    @classmethod
+    def fit(cls, rows, target, seed=0, progress=None, max_bytes=inf, keep=compute_anew):
+        """See `fit_harmonics`."""
+        return fit_harmonics(rows, target, seed, progress or _quiet, max_bytes)
+
+    @classmethod
+    def check(cls, directions, components):
+        """See `check_harmonics`."""
+        check_harmonics(directions, None if components == "auto" else components)
+
+    @classmethod
+    def default_components(cls, directions, points):
+        """Seven bands, or as many as the lattice tells apart."""
+        return most_harmonics(directions, DEFAULT_HARMONICS)
+
+    @classmethod
+    def fit_bytes(cls, points, directions, components):
+        """The harmonics as functions."""
+        return FIT_BYTES * components * directions
 
     @property
     def bands(self):
@@ -337,6 +361,10 @@ def _energies(rows, functions, gram):
 
     energies, total, energy = rows.sums(sums)
     return energies, centred(energy, total, len(rows.index)), energy
+
+
+def _quiet(done, total):
+    """The progress of a fit that nobody follows."""
 
 
 def check_harmonics(directions, components):

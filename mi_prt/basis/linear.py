@@ -7,6 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
+from ..system.schema import Array
 from .basis import Basis
 
 
@@ -36,6 +37,17 @@ class LinearBasis(Basis):
     captured_variance: np.ndarray
 
     ARRAYS = ("vectors", "mean", "sqrt_weights", "captured_variance")
+
+    @classmethod
+    def shapes(cls, channels):
+        """Functions of (d, s), or of (d, 3, s) where they hold the colour channels."""
+        colour = (3,) if channels == 3 and cls.joins_channels else ()
+        return {
+            "vectors": Array("f4", ("d", *colour, "s"), unit="sr^(-1/2)"),
+            "mean": Array("f4", (*colour, "s"), unit="irradiance per unit radiance and steradian"),
+            "sqrt_weights": Array("f4", ("s",), least=0, unit="sr^(1/2)"),
+            "captured_variance": Array("f8", ("d",)),
+        }
 
     def __len__(self):
         """Number of components d."""

@@ -21,6 +21,7 @@ import numpy as np
 import scipy.linalg
 
 from ..system.parallel import map_chunks, one_blas_thread
+from .basis import BASES, compute_anew
 from .linear import LinearBasis
 from .rows import Rows
 from .target import Fit, Target, check_room
@@ -49,12 +50,31 @@ MOST_GRAM_BYTES = 1 << 29  # a larger Gram matrix is no choice, only where there
 ITERATION_BYTES = 110
 
 
+@BASES.register
 class PCA(LinearBasis):
     """Eigentransport: the orthonormal components that capture the most variance of a scene's own
     transport.
     """
 
     kind = "pca"
+    why = "components of this scene's own transport: the least error for their number"
+    joins_channels = True
+    work = (3, 20)
+
+    @classmethod
+    def fit(cls, rows, target, seed=0, progress=None, max_bytes=np.inf, keep=compute_anew):
+        """See `fit_pca`."""
+        return fit_pca(rows, target, seed, progress or _quiet, max_bytes, keep)
+
+    @classmethod
+    def most_components(cls, directions, points):
+        """The rank that centred transport can have."""
+        return min(points - 1, len(directions))
+
+    @classmethod
+    def fit_bytes(cls, points, directions, components):
+        """See `fit_bytes` of this module."""
+        return fit_bytes(points, directions, components)
 
     def paper_irradiance(self, coefficients, radiance):
         """Irradiance (n, 3) by the paper's mean compensation (eqs. 3 and 8–10), for comparison.
@@ -65,16 +85,15 @@ class PCA(LinearBasis):
         return compensated @ self.project_light(radiance)[0]
 
 
-def compute_anew(name, compute):
-    """The `keep` of `fit_pca` that keeps nothing."""
-    return compute()
+def _quiet(done, total):
+    """The progress of a fit that nobody follows."""
 
 
 def fit_pca(
     rows: Rows,
     target: Target,
     seed=0,
-    progress=lambda done, total: None,
+    progress=_quiet,
     max_bytes=np.inf,
     keep=compute_anew,
 ) -> Fit:

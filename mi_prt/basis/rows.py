@@ -73,3 +73,25 @@ class Rows:
 
         total, squares = self.sums(moments)
         return total / len(self.index) * self.sqrt_weights, squares
+
+
+def encoded(encode, transport, progress=None, join=np.concatenate):
+    """Coefficients of all rows of transport, block by block.
+
+    Parameters
+    ----------
+    encode : callable((b, s) float32) returning coefficients of a block
+    transport : DirectTransport
+    progress : callable(done, total), optional
+    join : callable(list of blocks)
+    """
+    n, _ = transport.shape
+    blocks = []
+    for block in map_chunks(
+        lambda first: encode(transport.rows(slice(first, first + BLOCK_ROWS))),
+        range(0, n, BLOCK_ROWS),
+    ):
+        blocks.append(block)
+        if progress:
+            progress(min(len(blocks) * BLOCK_ROWS, n), n)
+    return join(blocks)

@@ -72,7 +72,7 @@ def carrier(basis):
         .standard_normal((PROBES, len(basis.sqrt_weights)))
         .astype(np.float32)
     )
-    if basis.kind != PCA.kind:
+    if not basis.joins_channels:
         return Carrier(basis, random)
     mean = basis.mean.astype(np.float64) * basis.sqrt_weights
     beyond = mean - (basis.vectors @ mean) @ basis.vectors

@@ -3,22 +3,23 @@ explained.
 """
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from ..asset.meshless_asset import MeshlessAsset
 from ..asset.provenance import open_scene_of
 from ..errors import SettingsError
-from ..lighting.emission import emission_of
-from ..lighting.scene_light import chosen_local_light, lit_scene, turned_light
-from ..render.display import display, exposure
-from ..render.image import coverage, pick_sensor, render_image, resized
-from . import ground_truth, metrics
-from .local_lights import measure_error
+from ..lighting.own_light import SceneLight, resolve
+from ..lighting.to_mitsuba import lit_scene
+from ..render.image import pick_sensor, render_image, resized
+from ..render.picture import Picture
+from . import ground_truth
+from .local_lights import stand_in_error
+from .near_emitters import near_emitters
+from .norms import errors_at_points, image_errors
 from .report import write_report
+from .views import compared_points, first_hits, visible_weights
 
 REFERENCES = ("modelled", "full")
 COMPARED_POINTS = 4096
@@ -26,6 +27,7 @@ POINT_SAMPLES = 4096  # samples of the emitters at each compared point
 POINT_PATHS = 1024  # paths from each compared point, where light is reflected
 # samples per pixel of the asset's own image: it has no noise but that of antialiasing
 IMAGE_SAMPLES = 64
+VIEW_SAMPLES = 16  # rays of each pixel that tell which points are seen
 
 
 def compare(
@@ -50,9 +52,8 @@ def compare(
     asset : Asset
     folder : path
         Gets report.json, index.html, EXRs and PNGs; created if need be.
-    light : what `as_light` accepts, or a list of such and 'scene', optional
-        By default 'scene': the scene's own distant light, or its local light if the asset is one of
-        local lights.
+    light : what `as_light` accepts, 'scene', or a list of these, optional
+        By default the scene's own light, as far as the asset holds it.
     rotate : (axis, degrees), optional
         Turns the distant light.
     scene : path, dict or mi.Scene, optional
@@ -70,21 +71,26 @@ def compare(
     nearest : int
         Directions that stand for a local light, see `Asset.irradiance`.
     direct : 'points' or 'pixels'
-        Of an asset of local lights, where direct light of the image is computed.
+        Where direct light of local lights is computed for the image.
 
     Returns
     -------
     dict
-        points{count, relative_rmse, bias, reference_noise, …}, image{relative_rmse, bias, psnr,
-        flip, reference_noise, …}, seconds{relight, reference}, and what was compared. Of an asset
-        of distant light, with local lights, also local_light_error{relative_rmse, bias, points}:
-        that of their irradiance alone. Of one of local lights also components{direct, indirect}
-        with errors as those of the points.
+        points{count and what `errors_at_points` gives}, image{what `image_errors` gives},
+        components{direct, indirect: as points} where all transports tell them apart,
+        transports{kind: what it holds}, ledger, seconds{relight, reference}, and what was compared.
+        Where transport of distant light stands in for local lights also
+        local_light_error{relative_rmse, bias, points}: that of their irradiance alone.
+
+    Raises
+    ------
+    SettingsError, SceneError, LightError
 
     Warns
     -----
     LightWarning
-        If a local light is inside the convex hull of the scene; with the measured error.
+        If a local light is inside the convex hull of the scene and only transport of distant light
+        is there for it; with the measured error.
     """
     if reference not in REFERENCES:
         raise SettingsError(f"reference '{reference}' is not known: use {' or '.join(REFERENCES)}")
@@ -94,148 +100,112 @@ def compare(
         )
     folder = _made_folder(folder)
     opened = open_scene_of(asset, scene)
-    if isinstance(asset, MeshlessAsset):
-        if rotate is not None or nearest != 1:
-            raise SettingsError(
-                "rotate and nearest are for distant light, and this asset is one of local lights"
-                " (points='samples')"
-            )
-        case = _under_local_lights(asset, opened, light, reference, direct, seed)
-    else:
-        if direct != "points":
-            raise SettingsError(
-                f"direct '{direct}' is for an asset of local lights (points='samples'), and this is"
-                " one of distant light"
-            )
-        case = _under_distant_light(asset, opened, light, rotate, reference, nearest, seed)
-    seconds = {}
+    resolved = asset.resolved(light, rotate, opened)
+    as_written = reference == "full" and light is None and rotate is None
+    shown = resolve(SceneLight(), opened) if as_written else resolved
+    truth = lit_scene(opened, shown, modelled=reference == "modelled")
+    picture = Picture(asset, opened, resolved, "total", direct, nearest)
 
+    seconds = {}
     progress("relight", 0, 3)
     started = time.perf_counter()
-    irradiance = case.irradiance()
+    irradiance = picture.at_points()
     seconds["relight"] = time.perf_counter() - started
 
-    progress("reference at the points", 1, 3)
     started = time.perf_counter()
-    chosen = ground_truth.compared_points(asset, COMPARED_POINTS, seed)
     bounces = asset.reference_bounces
-    points = asset.points.at(chosen)
-    truth_direct = ground_truth.point_irradiance(case.truth, points, POINT_SAMPLES, seed)
-    truth_indirect = ground_truth.indirect_irradiance(
-        case.truth, points, POINT_PATHS, bounces, seed
-    )
-
-    progress("reference image", 2, 3)
-    with resized(pick_sensor(case.truth, sensor), size) as camera:
-        expected = ground_truth.image(
-            case.truth, camera, spp, seed, ground_truth.path_depth(bounces)
-        )
+    with resized(pick_sensor(truth, sensor), size) as camera:
+        progress("reference at the points", 1, 3)
+        points = _Points(asset, opened, truth, camera, bounces, seed)
+        progress("reference image", 2, 3)
+        depth = ground_truth.path_depth(bounces)
+        expected = ground_truth.image(truth, camera, spp, seed, depth)
         seconds["reference"] = time.perf_counter() - started
-        result = case.image(camera, irradiance)
-        covered = coverage(case.truth, camera, IMAGE_SAMPLES, seed) > 1 - 1e-4
+        result = render_image(
+            asset, truth, camera, IMAGE_SAMPLES, seed, picture.irradiance(), picture.direct
+        )
+        hits = first_hits(truth, camera, IMAGE_SAMPLES, seed)
     progress("report", 3, 3)
 
+    covered = hits.coverage > 1 - 1e-4
     report = {
         "asset": str(asset.path) if asset.path else None,
         "scene": opened.source.path,
+        "light": [part.words for part in resolved.parts],
         "reference": reference,
         "left_out": asset.scene["left_out"],
-        "bounces": asset.report["bounces"],
         "reference_bounces": "any number" if bounces is None else bounces,
-        **case.told(chosen, truth_direct, truth_indirect),
-        "points": (
-            {"count": len(chosen)} | _errors(irradiance[chosen], truth_direct + truth_indirect)
-        ),
-        "image": _image_errors(result, expected, covered),
+        "transports": {kind: t.summary() for kind, t in asset.transports.items()},
+        "ledger": [entry.as_dict() for entry in asset.ledger()],
+        **stand_in_error(asset, resolved, nearest, lambda: opened, seed),
+        "points": {"count": len(points.index)} | points.errors(irradiance),
+        "components": points.component_errors(picture),
+        "image": image_errors(result, expected, covered, hits.emits),
         "seconds": {name: round(value, 4) for name, value in seconds.items()},
     }
     write_report(folder, report, result, expected.mean, covered)
     return report
 
 
-@dataclass(frozen=True, eq=False)
-class _Case:
-    """What is compared.
+@dataclass(eq=False)
+class _Points:
+    """Points at which an asset is compared, and the truth there.
 
-    Parameters
-    ----------
-    truth : mi.Scene
-    irradiance : callable() -> (n, 3)
-    image : callable(sensor, irradiance) -> (h, w, 3)
-    told : callable(chosen, truth_direct, truth_indirect) -> dict
-        What a report says of this kind of asset.
+    They are drawn where the sensor looks and evenly over all points, half each.
     """
 
+    asset: object
+    opened: object
     truth: object
-    irradiance: Callable
-    image: Callable
-    told: Callable
+    camera: object
+    bounces: object
+    seed: int
 
-
-def _under_distant_light(asset, opened, light, rotate, reference, nearest, seed):
-    shown, chosen_light = turned_light(opened, light, rotate)
-    truth = lit_scene(opened.modelled() if reference == "modelled" else opened.mi_scene, shown)
-
-    def told(*_):
-        any_number = asset.reference_bounces is None
-        report = {
-            "basis": asset.basis.kind,
-            "coefficients": len(asset.basis),
-            "directions": len(asset.directions),
-            # What the reference has more:
-            "bounce_energy_left": (
-                asset.report.get("bounce_energy_left", 0.0) if any_number else 0.0
-            ),
-            "indirect_noise": asset.report.get("indirect_noise", 0.0),
-            "captured_variance": asset.report["captured_variance"],
-        }
-        if chosen_light.point_lights:
-            report["local_light_error"] = measure_error(
-                asset, chosen_light.point_lights, nearest, opened, seed
-            )
-        return report
-
-    return _Case(
-        truth,
-        lambda: asset.irradiance_from(
-            *asset.project_light(chosen_light), chosen_light.point_lights, nearest
-        ),
-        lambda camera, irradiance: render_image(
-            asset, truth, camera, IMAGE_SAMPLES, seed, irradiance
-        ),
-        told,
-    )
-
-
-def _under_local_lights(asset, opened, light, reference, direct, seed):
-    shown, keep_local, chosen_light = chosen_local_light(opened, light)
-    as_written = opened.mi_scene if keep_local else opened.unlit()
-    truth = lit_scene(
-        opened.modelled(keep_local) if reference == "modelled" else as_written, shown, keep_local
-    )
-
-    def told(chosen, truth_direct, truth_indirect):
-        components = {"direct": truth_direct, "indirect": truth_indirect}
-        return {
-            "coefficients": asset.settings["depth_coefficients"],
-            "directions": asset.settings["depth_directions"],
-            "transfer_coefficients": asset.settings["transfer_coefficients"],
-            "misclassified_visibility": asset.report["misclassified_visibility"],
-            "components": {
-                name: _errors(asset.irradiance(chosen_light, name)[chosen], expected)
-                for name, expected in components.items()
-            },
-        }
-
-    def image(camera, irradiance):
-        if direct == "points":
-            return render_image(asset, truth, camera, IMAGE_SAMPLES, seed, irradiance)
-        indirect = asset.irradiance(chosen_light, "indirect")
-        return render_image(
-            asset, truth, camera, IMAGE_SAMPLES, seed, indirect, emission_of(chosen_light)
+    def __post_init__(self):
+        points, seed = self.asset.points, self.seed
+        visible = visible_weights(
+            self.truth,
+            points.locator(self._wrapped()),
+            len(points),
+            self.camera,
+            VIEW_SAMPLES,
+            seed,
+        )
+        self.index, weights = compared_points(
+            points.buried, points.areas, visible, COMPARED_POINTS, seed
+        )
+        self._areas = points.areas[self.index] * weights
+        self._visible = visible[self.index] * weights
+        chosen = points.at(self.index)
+        spacing = np.broadcast_to(points.layout.spacing(points), len(points))[self.index]
+        self._near = near_emitters(self.opened, chosen, spacing)
+        self._direct = ground_truth.point_irradiance(self.truth, chosen, POINT_SAMPLES, seed)
+        self._indirect = ground_truth.indirect_irradiance(
+            self.truth, chosen, POINT_PATHS, self.bounces, seed
         )
 
-    return _Case(truth, lambda: asset.irradiance(chosen_light), image, told)
+    def _wrapped(self):
+        from ..scene.scene import Scene
+
+        return Scene(self.truth, self.opened.source)
+
+    def errors(self, irradiance, component="total"):
+        """Errors of irradiance (n, 3) of all points."""
+        expected = {
+            "direct": self._direct,
+            "indirect": self._indirect,
+            "total": self._direct + self._indirect,
+        }[component]
+        found = irradiance[self.index]
+        return errors_at_points(found, expected, self._areas, self._visible, self._near)
+
+    def component_errors(self, picture):
+        """Errors of direct and indirect light, where the asset tells them apart."""
+        return {
+            name: self.errors(picture.component_at_points(name), name)
+            for name in ("direct", "indirect")
+            if picture.holds(name)
+        }
 
 
 def _made_folder(folder):
@@ -249,31 +219,3 @@ def _made_folder(folder):
             f"output folder '{folder}' cannot be written: {error.strerror}"
         ) from None
     return folder
-
-
-def _errors(result, reference):
-    rmse = metrics.relative_rmse(result, reference.mean)
-    noise = reference.noise
-    return {
-        "relative_rmse": rmse,
-        "bias": metrics.relative_bias(result, reference.mean),
-        "reference_noise": noise,
-        "relative_rmse_beyond_noise": float(np.sqrt(max(rmse**2 - noise**2, 0.0))),
-    }
-
-
-def _image_errors(result, expected, covered):
-    """Linear errors and PSNR over pixels that geometry covers wholly; FLIP over the whole image."""
-    if not covered.any():
-        raise SettingsError("the sensor sees no surface: nothing to compare in the image")
-    masked = ground_truth.Reference(expected.mean[covered], expected.standard_error[covered])
-    factor = exposure(masked.mean)
-    shown, truth = display(result, factor), display(expected.mean, factor)
-    mean_flip, _ = metrics.flip(shown, truth)
-    return _errors(result[covered], masked) | {
-        "psnr": metrics.psnr(shown, truth, covered),
-        "flip": mean_flip,
-        "exposure": factor,
-        "covered": float(covered.mean()),
-        "size": [result.shape[1], result.shape[0]],
-    }

@@ -2,24 +2,26 @@
 
 import warnings
 
+from ..errors import SceneError
 from ..lighting.environment import LightWarning
-from ..lighting.light import Light
-from ..lighting.local import hull_warning
-from ..lighting.scene_light import lit_scene
+from ..lighting.to_mitsuba import lit_scene
+from ..transport.transport import Question
 from . import ground_truth, metrics
 
 MEASURED_POINTS = 4096
+MEASURED_SAMPLES = 64  # of each light, from each of them
 MEASURED_PATHS = 128  # from each of them, where light is reflected
 
 
-def measure_error(asset, lights, nearest, scene, seed=0):
+def measure_error(asset, light, nearest, scene, seed=0):
     """Measure the error of local lights, and warn with it of those that stand inside the scene's
     convex hull.
 
     Parameters
     ----------
     asset : Asset
-    lights : tuple of PointLight
+    light : Light
+        Resolved, of local parts.
     nearest : int
         Directions that stand for a light.
     scene : Scene
@@ -36,8 +38,7 @@ def measure_error(asset, lights, nearest, scene, seed=0):
     Raises
     ------
     SceneError
-        If the transport holds reflections, and the scene cannot be rebuilt with the materials that
-        it models.
+        If the scene cannot be rebuilt with the materials that the transport models.
 
     Warns
     -----
@@ -45,20 +46,19 @@ def measure_error(asset, lights, nearest, scene, seed=0):
         If a light is inside the hull.
     """
     chosen = ground_truth.compared_points(asset, MEASURED_POINTS, seed)
-    irradiance = asset.local_irradiance(lights, nearest)
+    transport = asset.transports["distant"]
+    irradiance = transport.respond(asset.points, Question(light, nearest=nearest))
     points = asset.points.at(chosen)
-    truth = ground_truth.local_irradiance(scene.occluders, points, lights)
-    if asset.settings["bounces"] != 0:
-        lit = lit_scene(scene.modelled(), Light(point_lights=tuple(lights)))
-        truth += ground_truth.indirect_irradiance(
-            lit, points, MEASURED_PATHS, asset.reference_bounces, seed
-        ).mean
+    lit = lit_scene(scene, light, modelled=True)
+    truth = ground_truth.irradiance(
+        lit, points, MEASURED_SAMPLES, MEASURED_PATHS, asset.reference_bounces, seed
+    ).mean
     error = {
         "relative_rmse": metrics.relative_rmse(irradiance[chosen], truth),
         "bias": metrics.relative_bias(irradiance[chosen], truth),
         "points": len(chosen),
     }
-    warning = hull_warning(lights, asset.points.hull)
+    warning = transport.check(asset.points, light)
     if warning:
         measured = (
             f"relative RMSE {error['relative_rmse']:.1%} and bias {error['bias']:+.1%} at"
@@ -66,3 +66,35 @@ def measure_error(asset, lights, nearest, scene, seed=0):
         )
         warnings.warn(f"{warning}: {measured}", LightWarning, stacklevel=3)
     return error
+
+
+def stand_in_error(asset, light, nearest, open_scene, seed=0):
+    """The entry local_light_error{…} where transport of distant light stands in for local lights;
+    nothing where it does not, or where the scene is not to be had (with a warning).
+
+    Parameters
+    ----------
+    asset : Asset
+    light : Light
+        Resolved.
+    nearest : int
+    open_scene : callable() returning Scene or None
+        None where it is not worth to open it.
+    seed : int
+    """
+    shares = asset.shared_out(light)
+    local = shares["distant"].local if "distant" in shares else None
+    if local is None or local.is_empty:
+        return {}
+    found = asset.warnings(shares)
+    try:
+        scene = open_scene()
+        if scene is None:
+            return {}
+        return {"local_light_error": measure_error(asset, local, nearest, scene, seed)}
+    except SceneError as error:
+        warning = f"{found[0]}; by" if found else "local lights: by"
+        warnings.warn(
+            f"{warning} how much it errs cannot be measured: {error}", LightWarning, stacklevel=3
+        )
+        return {}

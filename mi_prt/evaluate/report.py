@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..output.export import write_displayed, write_image
 from ..render.display import LUMINANCE, display
+from ..render.image_file import write_displayed, write_image
 from . import metrics
 
 _PAGE = """<!doctype html>
@@ -131,16 +131,15 @@ def _page(report):
 
 def _held(report):
     """What the asset holds, in words."""
-    if "transfer_coefficients" in report:
-        return (
-            f"{report['coefficients']} coefficients of depth in {report['directions']:,} directions"
-            f" at each sample, {report['transfer_coefficients']} of direct light on each cluster."
-        )
-    return (
-        f"{report['coefficients']} coefficients over {report['directions']:,} directions hold"
-        f" {report['captured_variance']:.2%} of the transport's variance (relighting includes"
-        " averaging light over the lattice)."
-    )
+    parts = []
+    for kind, summary in report["transports"].items():
+        shown = {k: v for k, v in summary.items() if isinstance(v, int | float | str)}
+        parts.append(f"{kind}: " + ", ".join(f"{k} {_number(v)}" for k, v in shown.items()))
+    return "; ".join(parts) + "."
+
+
+def _number(value):
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def _causes(report):
@@ -150,9 +149,25 @@ def _causes(report):
         f" {report['image']['reference_noise']:.2%} in the image are Mitsuba's own; more spp lower"
         " them."
     )
-    yield from (
-        _local_causes(report) if "transfer_coefficients" in report else _distant_causes(report)
-    )
+    for entry in sorted(report["ledger"], key=lambda entry: -entry["value"]):
+        yield (
+            f"{entry['stage']}: {entry['what']}, {entry['value']:.2%} of {entry['norm']}"
+            f" ({entry['how']}); the setting {entry['knob']} lowers it."
+        )
+    if "local_light_error" in report:
+        local = report["local_light_error"]
+        yield (
+            f"Local lights: {local['relative_rmse']:.1%} relative RMSE and {local['bias']:+.1%}"
+            " bias by themselves. They are seen through the nearest directions of the lattice, and"
+            " where they stand inside the scene's convex hull, with visibility to infinity."
+        )
+    if "distant" in report["transports"]:
+        cells = report["transports"]["distant"]["cells"]
+        yield (
+            "Directions: distant light and its shadows are averaged over cells of"
+            f" {np.degrees(np.sqrt(4 * np.pi / cells)):.1f}°, which blurs the shadow of a small"
+            " sun."
+        )
     yield (
         "Points: irradiance is interpolated between points; shadows narrower than their distance"
         " are lost."
@@ -169,52 +184,3 @@ def _causes(report):
             else "in neither image"
         )
         yield f"Not modelled: {entry['what']}{share}, {seen}."
-
-
-def _distant_causes(report):
-    if report["basis"] != "none":
-        yield (
-            f"Compression: {1 - report['captured_variance']:.2%} of the transport's variance is not"
-            f" in the basis ({report['basis']}); more coefficients lower it."
-        )
-    if "local_light_error" in report:
-        local = report["local_light_error"]
-        yield (
-            f"Local lights: {local['relative_rmse']:.1%} relative RMSE and {local['bias']:+.1%}"
-            " bias by themselves. They are seen through the nearest directions of the lattice, and"
-            " where they stand inside the scene's convex hull, with visibility to infinity."
-        )
-    if report["bounces"] != 0:
-        noise = (
-            f"noise {report['indirect_noise']:.2%} of the transport"
-            if report["indirect_noise"]
-            else "without noise"
-        )
-        left = report["bounce_energy_left"]
-        left = (
-            "has no known bound"
-            if left is None
-            else f"is at most {left:.2%} of the direct light of an open sky"
-        )
-        yield (
-            f"Reflections: {noise} (more --paths-per-point lower it); light of the last ones left"
-            f" out {left}."
-        )
-    yield (
-        "Directions: light and shadows are averaged over cells of"
-        f" {np.degrees(np.sqrt(4 * np.pi / report['directions'])):.1f}°, which blurs the shadow of"
-        " a small sun."
-    )
-
-
-def _local_causes(report):
-    yield (
-        f"Visibility: depth buffers of {report['directions']:,} directions err about"
-        f" {report['misclassified_visibility']:.1%} of the pairs of a sample and a light, at the"
-        " edges of shadows; more --depth-directions and --depth-coefficients lower it."
-    )
-    yield (
-        f"Reflections: {report['transfer_coefficients']} patterns on each cluster stand for direct"
-        " light; more --transfer-coefficients, smaller clusters and a smaller --transfer-error"
-        " lower what they lose."
-    )

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import SettingsError
+from ..render.image_file import to_8bit, write_displayed
 from ..system.files import check_writable, replacing
-from .export import to_8bit, write_displayed
 
 VIDEOS = (".mp4", ".gif")
 MAX_FPS = {".mp4": 240, ".gif": 50}  # viewers slow down a GIF of more

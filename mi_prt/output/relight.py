@@ -1,24 +1,13 @@
 """From an asset and light to a file: image, mesh with vertex radiance, or plain arrays."""
 
 import time
-import warnings
-from pathlib import Path
 
-from ..asset.meshless_asset import MeshlessAsset
 from ..asset.provenance import open_scene_of
-from ..errors import SceneError, SettingsError
-from ..evaluate.local_lights import measure_error
-from ..lighting.environment import LightWarning
-from ..lighting.local import hull_warning
-from ..lighting.scene_light import is_of_scene, lit_scene, turned_light
+from ..evaluate.local_lights import stand_in_error
 from ..render.display import exposure
-from ..render.image import pick_sensor, render_image, resized
-from ..scene.scene import Scene
+from ..render.picture import RENDERERS, Picture
 from ..system.files import check_writable
-from .export import write_image, write_npz, write_ply
-from .relight_local import IMAGES, MESHES, relight_local
-
-RENDERERS = ("mitsuba", "raster")
+from .formats import Relit, format_of
 
 
 def relight_to_file(
@@ -41,10 +30,9 @@ def relight_to_file(
     ----------
     asset : Asset
     output : path
-        .exr (linear) or .png (exposed, sRGB) image; .ply or .npz of the points.
-    light : what `as_light` accepts, or a list of such and 'scene', optional
-        By default 'scene': the scene's own distant light, or its local light if the asset is one of
-        local lights.
+        .exr (linear) or .png (exposed, sRGB) image; .ply or .npz of the points; see `FORMATS`.
+    light : what `as_light` accepts, 'scene', or a list of these, optional
+        By default the scene's own light, as far as the asset holds it.
     rotate : (axis, degrees), optional
         Turns the distant light.
     scene : path, dict or mi.Scene, optional
@@ -56,21 +44,20 @@ def relight_to_file(
     spp : int
         Samples per pixel of the integrator.
     nearest : int
-        Directions that stand for a local light in an asset of distant light, see
+        Directions that stand for a local light where only transport of distant light is there, see
         `Asset.irradiance`.
     component : 'total', 'direct' or 'indirect'
-        Of an asset of local lights, what is shown.
+        What is shown.
     direct : 'points' or 'pixels'
-        Of an asset of local lights, where direct light is computed: at the points, or with shadow
-        rays at each pixel.
+        Where direct light of local lights is computed: at the points, or with shadow rays at each
+        pixel.
 
     Returns
     -------
     dict
-        points, seconds{project, relight, render}. With local lights, and where the scene is opened,
-        which it is for images and if one of them is inside its convex hull:
-        local_light_error{relative_rmse, bias, points}, the error of their irradiance against
-        Mitsuba's.
+        points, seconds{relight, render}. Where transport of distant light stands in for local
+        lights, and the scene is at hand, also local_light_error{relative_rmse, bias, points}, the
+        error of their irradiance against Mitsuba's.
 
     Raises
     ------
@@ -79,83 +66,39 @@ def relight_to_file(
     Warns
     -----
     LightWarning
-        If a local light is inside the convex hull of the scene; with the measured error.
+        If a local light is inside the convex hull of the scene and only transport of distant light
+        is there for it; with the measured error.
     """
-    if isinstance(asset, MeshlessAsset):
-        if rotate is not None or nearest != 1:
-            raise SettingsError(
-                "rotate and nearest are for distant light, and this asset is one of local lights"
-                " (points='samples')"
-            )
-        return relight_local(
-            asset, output, light, scene, sensor, size, renderer, spp, component, direct
-        )
-    if (component, direct) != ("total", "points"):
-        raise SettingsError(
-            f"component '{component}', direct '{direct}': an asset of distant light holds all light"
-            " in one; precompute the scene with points='samples' to tell them apart"
-        )
-    output = Path(output)
-    suffix = output.suffix.lower()
-    if suffix not in IMAGES + MESHES:
-        raise SettingsError(f"output '{output}' must end in {', '.join(IMAGES + MESHES)}")
-    if renderer not in RENDERERS:
-        raise SettingsError(f"renderer '{renderer}' is not known: use {' or '.join(RENDERERS)}")
+    written = format_of(output)
+    RENDERERS[renderer]
     check_writable(output)
-
-    needs_scene = suffix in IMAGES or is_of_scene(light)
-    opened = open_scene_of(asset, scene) if needs_scene else None
-    shown, chosen = turned_light(opened, light, rotate)
-    if renderer == "raster":
-        from ..render.raster import RasterScene  # opens OpenGL: only where it is asked for
-
+    opened = open_scene_of(asset, scene) if written.is_picture else None
+    resolved = asset.resolved(light, rotate, opened or scene)
     clock = [time.perf_counter()]
-    projected = asset.project_light(chosen)
-    clock.append(time.perf_counter())
-    irradiance = asset.irradiance_from(*projected, chosen.point_lights, nearest)
-    radiance = asset.outgoing_radiance(irradiance)
-    clock.append(time.perf_counter())
-    if suffix == ".ply":
-        write_ply(output, asset, radiance)
-    elif suffix == ".npz":
-        write_npz(output, asset, radiance, irradiance)
+    if written.is_picture:
+        picture = Picture(asset, opened, resolved, component, direct, nearest)
+        irradiance = picture.irradiance()
+        clock.append(time.perf_counter())
+        with picture.drawn(sensor, size, renderer, spp) as draw:
+            image = draw(irradiance)
+        relit = Relit(asset, irradiance, None, picture.exposure(), image)
     else:
-        factor = exposure(radiance[~asset.buried])
-        lit = Scene(lit_scene(opened.mi_scene, shown), opened.source)
-        with resized(pick_sensor(lit.mi_scene, sensor), size) as camera:
-            if renderer == "raster":
-                with RasterScene(asset, lit, camera) as raster:
-                    image = raster.radiance(irradiance)
-            else:
-                image = render_image(asset, lit.mi_scene, camera, spp, irradiance=irradiance)
-        write_image(output, image, factor)
+        shares = asset.shared_out(resolved)
+        irradiance = asset.answered(shares, component, nearest)
+        radiance = asset.outgoing_radiance(irradiance)
+        clock.append(time.perf_counter())
+        relit = Relit(asset, irradiance, radiance, exposure(radiance[~asset.buried]))
+    written.write(output, relit)
     clock.append(time.perf_counter())
-    stages = zip(("project", "relight", "render"), clock, clock[1:])
+    seconds = zip(("relight", "render"), clock, clock[1:])
     result = {
         "points": len(asset.points),
-        "seconds": {name: round(b - a, 5) for name, a, b in stages},
+        "seconds": {name: round(b - a, 5) for name, a, b in seconds},
     }
-    if chosen.point_lights:
-        result |= _local_light_error(asset, chosen.point_lights, nearest, opened, scene)
-    return result
 
+    def at_hand():
+        """The scene where it is open already, or worth opening."""
+        wanted = asset.warnings(asset.shared_out(resolved))
+        return opened or (open_scene_of(asset, scene) if wanted else None)
 
-def _local_light_error(asset, lights, nearest, opened, scene):
-    """The entry local_light_error, or none where the scene is neither open nor needed, or not to be
-    had.
-    """
-    warning = hull_warning(lights, asset.points.hull)
-    if opened is None and not warning:
-        return {}
-    try:
-        return {
-            "local_light_error": measure_error(
-                asset, lights, nearest, opened or open_scene_of(asset, scene)
-            )
-        }
-    except SceneError as error:
-        warning = f"{warning}; by" if warning else "local lights: by"
-        warnings.warn(
-            f"{warning} how much it errs cannot be measured: {error}", LightWarning, stacklevel=3
-        )
-        return {}
+    return result | stand_in_error(asset, resolved, nearest, at_hand)

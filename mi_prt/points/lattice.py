@@ -9,12 +9,30 @@ use the same numbering.
 """
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
+from ..system.schema import Array, Flag, Number, Record, Text, check
+from .layout import LAYOUTS, Layout
 
+MAX_LEVEL = 1 << 15
+_COUNT = Number(0, 1 << 40, whole=True)
+_SURFACE = Record(
+    {
+        "name": Text(),
+        "kind": Text(),
+        "signature": Text(),
+        "flipped": Flag(),
+        "first_patch": _COUNT,
+        "patches": _COUNT,
+    }
+)
+
+
+@LAYOUTS.register
 @dataclass(frozen=True, eq=False)
-class Patches:
+class Patches(Layout):
     """The patches of a point set, one per mesh face or analytic shape, in the order of surfaces and
     faces.
 
@@ -35,6 +53,54 @@ class Patches:
     offsets: np.ndarray
     nodes: np.ndarray
     back: np.ndarray
+
+    kind = "patches"
+    SHAPES: ClassVar[dict] = {
+        "levels": Array("i4", ("patches", 2), least=0, below=MAX_LEVEL),
+        "offsets": Array("i8", ("patches",), least=0, below="nodes+1"),
+        "nodes": Array("i4", ("nodes",), least=0, below="n"),
+        "back": Array("i4", ("patches",), least=0, below="n"),
+    }
+
+    def locator(self, scene, points):
+        """See `Layout.locator`."""
+        from .locate import PatchLocator
+
+        return PatchLocator(scene, points)
+
+    def spacing(self, points):
+        """Root of each point's area."""
+        return np.sqrt(points.areas)
+
+    def arrays(self):
+        """See `Layout.arrays`."""
+        return {name: getattr(self, name) for name in self.SHAPES}
+
+    @classmethod
+    def from_arrays(cls, arrays, report):
+        """See `Layout.from_arrays`."""
+        return cls(**arrays)
+
+    def check(self, points):
+        """Nodes of all patches are there, and so are the points behind them; surfaces know their
+        patches.
+        """
+        u, v = self.levels.astype(np.int64).T
+        sizes = node_count(u, v)
+        if (u < 1).any() or (self.offsets != np.cumsum(sizes) - sizes).any():
+            raise ValueError("layout/offsets do not fit the levels of the patches")
+        if sizes.sum() != len(self.nodes):
+            raise ValueError(f"layout/nodes are {len(self.nodes)} instead of {sizes.sum()}")
+        if (self.nodes + np.repeat(self.back.astype(np.int64), sizes) >= len(points)).any():
+            raise ValueError("layout/back leads beyond the points")
+        first = 0
+        for surface in points.surfaces:
+            check(surface, _SURFACE, "points.surfaces")
+            if surface["first_patch"] != first:
+                raise ValueError("points.surfaces do not list the patches in order")
+            first += surface["patches"]
+        if first != len(sizes):
+            raise ValueError(f"points.surfaces list {first} patches of {len(sizes)}")
 
     def triangles(self):
         """Triangles of points, (m, 3) int32; fronts only, those of zero extent left out."""

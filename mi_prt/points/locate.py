@@ -6,12 +6,14 @@ from ..errors import SceneError
 from ..scene.scene import mesh_arrays
 from ..scene.surface_table import SurfaceTable
 from ..system.runtime import mitsuba
+from .layout import Locator
 from .tessellate import TESSELLATED_SHAPES
 
 NO_PATCH = 0xFFFFFFFF
+_LEAST_KEPT = 1e-4  # weight of the points around a hit that are not buried, below which all count
 
 
-class PatchLocator:
+class PatchLocator(Locator):
     """Finds the points around surface hits of one Mitsuba scene.
 
     The scene may be organised otherwise than the one the points were made from: Mitsuba's loader
@@ -33,12 +35,60 @@ class PatchLocator:
 
     def __init__(self, scene, points):
         mi = mitsuba()
-        patches = points.patches
+        patches = points.layout
+        self._keep = mi.Float(np.where(points.buried, 0.0, 1.0).astype(np.float32))
         self._match(scene, points)
         self._levels = mi.UInt32(patches.levels.ravel().astype(np.uint32))
         self._offsets = mi.UInt32(patches.offsets.astype(np.uint32))
         self._nodes = mi.UInt32(patches.nodes.astype(np.uint32))
         self._back = mi.UInt32(patches.back.astype(np.uint32))
+
+    def interpolated(self, values, pi, si, ray, active):
+        """See `Locator.interpolated`; where all points around a hit are buried, all count."""
+        import drjit as dr
+
+        mi = mitsuba()
+        points, weights, found = self.locate(pi, si, active)
+        kept = [w * dr.gather(mi.Float, self._keep, p, found) for p, w in zip(points, weights)]
+        sum_kept = sum(kept)
+        usable = sum_kept > _LEAST_KEPT
+        shares = [dr.select(usable, k / sum_kept, w) for k, w in zip(kept, weights)]
+        value = sum(w * dr.gather(mi.Color3f, values, p, found) for p, w in zip(points, shares))
+        return value, found
+
+    def picked(self, pi, si, ray, active, random):
+        """See `Locator.picked`: interpolation in the mean, with a third of the entries."""
+        import drjit as dr
+
+        points, kept, found = self._kept(pi, si, active)
+        total = kept[0] + kept[1] + kept[2]
+        place = random * total
+        index = dr.select(
+            place < kept[0],
+            points[0],
+            dr.select(place < kept[0] + kept[1], points[1], points[2]),
+        )
+        return index, found & (total > _LEAST_KEPT)
+
+    def nearest(self, pi, si, ray, active, seen_from=None):
+        """See `Locator.nearest`: the one of the three with the largest weight. They lie on the face
+        that is met, so that none is behind it.
+        """
+        import drjit as dr
+
+        points, kept, found = self._kept(pi, si, active)
+        second = kept[1] > kept[0]
+        index, weight = dr.select(second, points[1], points[0]), dr.maximum(kept[0], kept[1])
+        index = dr.select(kept[2] > weight, points[2], index)
+        return index, found & (dr.maximum(weight, kept[2]) > _LEAST_KEPT)
+
+    def _kept(self, pi, si, active):
+        """The points around hits, their weights without buried ones, and whether there are any."""
+        import drjit as dr
+
+        points, weights, found = self.locate(pi, si, active)
+        keep = [dr.gather(mitsuba().Float, self._keep, p, found) for p in points]
+        return points, [w * k for w, k in zip(weights, keep)], found
 
     def _match(self, scene, points):
         """Fill the tables that lead from (surface, primitive) to patches."""
@@ -140,7 +190,7 @@ class _FaceIndex:
     """Patches of mesh faces, found by the positions of their three corners."""
 
     def __init__(self, points):
-        patches = points.patches
+        patches = points.layout
         is_triangle = np.flatnonzero(patches.levels[:, 1] == 0)
         k = patches.levels[is_triangle, 0].astype(np.int64)
         first = patches.offsets[is_triangle]

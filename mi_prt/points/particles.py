@@ -17,6 +17,7 @@ from ..errors import SceneError
 from ..scene.materials import facing, reflectance_at
 from ..scene.surface_table import SurfaceTable
 from ..system.runtime import mitsuba
+from .thinning import thin
 
 PARTICLES = 1 << 14  # on their way at a time
 STEPS = 64  # hits of each
@@ -24,6 +25,8 @@ WARM_UP = 5  # of those, that do not count yet
 OUTSIDE = 0.25  # share of the scene's extent by which flights that leave it are followed
 LINES = 1 << 16  # at a time
 CROSSINGS = 8  # of each line with surfaces, at a time
+FREE_CANDIDATES = 8  # for each place in free space that stays
+FLIGHTS = 1 << 18  # that places are drawn from
 _MOST_RUNS = 64
 _OFFSET = 2e-5  # share of the scene's scale by which rays start off a surface
 
@@ -149,6 +152,32 @@ def trace_particles(scene, count, seed=0):
         f"particles from the scene's sensors and local emitters find {found:,} places on surfaces"
         f" that reflect, too few for {count:,}"
     )
+
+
+def example_places(scene, count, seed=0, flights=None):
+    """Places in the space between surfaces, apart from each other: where lights may stand.
+
+    Parameters
+    ----------
+    scene : Scene
+    count : int
+    seed : int
+    flights : (k, 2, 3) float32, optional
+        Of particles; they are traced where they are not given.
+
+    Returns
+    -------
+    (count, 3) float32
+
+    Raises
+    ------
+    SceneError
+        See `trace_particles`.
+    """
+    if flights is None:
+        flights = trace_particles(scene, FLIGHTS, seed)[1]
+    places = free_places(flights, FREE_CANDIDATES * count, seed)
+    return places[thin(places, None, count, seed, dimension=3)[0]]
 
 
 def free_places(flights, count, seed=0):

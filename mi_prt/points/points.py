@@ -2,25 +2,18 @@
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 
 from ..errors import SceneError, SettingsError
 from ..system.runtime import mitsuba
+from ..system.schema import Array
 from .hull import ConvexHull
 from .lattice import Patches, node_count
+from .layout import Layout
 from .tessellate import TESSELLATED_SHAPES, patch_levels, tessellate
 
-POINT_FIELDS = (
-    "positions",
-    "normals",
-    "geometric_normals",
-    "albedo",
-    "insets",
-    "areas",
-    "uv",
-    "surface",
-)
 POINT_BUDGET = 40_000  # points that `auto` edge length aims at, beyond the meshes' own vertices
 MAX_POINTS = 4_000_000
 # between a point's normal and its faces', above which its hemisphere counts as dipping below them
@@ -46,10 +39,12 @@ class Points:
     uv : (n, 2) float32
     surface : (n,) int32
         Index into `surfaces`.
-    patches : Patches
+    buried : (n,) bool
+        Points inside or against other geometry, which pictures do not show.
+    layout : Layout
     surfaces : tuple of dict
-        name, kind, signature, flipped, first_patch and patches (their number) of each surface of
-        the scene.
+        name and kind of each surface of the scene; with patches also signature, flipped,
+        first_patch and patches (their number).
     report : dict
         What was irregular: counts of degenerate faces, zero and flipped normals, back sides, and
         points whose smooth normal is more than 1° off the mean of their faces, so that its
@@ -64,16 +59,33 @@ class Points:
     areas: np.ndarray
     uv: np.ndarray
     surface: np.ndarray
-    patches: Patches
+    buried: np.ndarray
+    layout: Layout
     surfaces: tuple
     report: dict
+
+    SHAPES: ClassVar[dict] = {
+        "positions": Array("f4", ("n", 3), unit="m"),
+        "normals": Array("f4", ("n", 3)),
+        "geometric_normals": Array("f4", ("n", 3)),
+        "albedo": Array("f4", ("n", 3), unit="1, linear RGB reflectance"),
+        "insets": Array("f4", ("n", 3)),
+        "areas": Array("f4", ("n",), least=0, unit="m^2"),
+        "uv": Array("f4", ("n", 2)),
+        "surface": Array("i4", ("n",), least=0, below="surfaces"),
+        "buried": Array("?", ("n",)),
+    }
 
     def __len__(self):
         return len(self.positions)
 
     def at(self, index):
-        """Only the points of an index array; `patches` stay those of all points."""
-        return replace(self, **{name: getattr(self, name)[index] for name in POINT_FIELDS})
+        """Only the points of an index array; `layout` stays that of all points."""
+        return replace(self, **{name: getattr(self, name)[index] for name in self.SHAPES})
+
+    def locator(self, scene):
+        """What finds the points around hits in a Scene, a Locator."""
+        return self.layout.locator(scene, self)
 
     @cached_property
     def hull(self):
@@ -114,7 +126,7 @@ def sample_points(scene, edge_length="auto"):
     surfaces, backs = [], []
     counts = {"degenerate_faces": 0, "zero_normals": 0, "flipped_normals": 0, "back_points": 0}
     total = patch_total = 0
-    columns = {name: [] for name in POINT_FIELDS}
+    columns = {name: [] for name in Points.SHAPES}
     levels, nodes = [], []
     for index, surface in enumerate(scene.surfaces):
         if surface.kind not in TESSELLATED_SHAPES:
@@ -132,6 +144,7 @@ def sample_points(scene, edge_length="auto"):
             columns["areas"].append(part.areas)
             columns["uv"].append(part.uv)
             columns["surface"].append(np.full(n, index))
+            columns["buried"].append(np.zeros(n, bool))
         surfaces.append(_describe(surface, patch_total, len(part.levels)))
         levels.append(part.levels)
         nodes.append(part.nodes + total)
@@ -161,11 +174,8 @@ def sample_points(scene, edge_length="auto"):
         np.radians(DIPPING_DEGREES)
     )
     return Points(
-        **{
-            name: values.astype(np.int32 if name == "surface" else np.float32)
-            for name, values in joined.items()
-        },
-        patches=Patches(
+        **{name: values.astype(Points.SHAPES[name].dtype) for name, values in joined.items()},
+        layout=Patches(
             levels,
             np.cumsum(sizes) - sizes,
             np.concatenate(nodes).astype(np.int32),

@@ -3,7 +3,9 @@
 import numpy as np
 
 from ..errors import SceneError
+from ..scene.materials import facing
 from ..system.runtime import mitsuba
+from .layout import Locator
 
 REACH = 2.5  # radii up to which a sample is found
 VOXEL = 1.5  # radii along the edge of a voxel
@@ -112,10 +114,7 @@ class SampleLocator:
 
         def visit(state, sample, place, distance, cosine):
             total, weights = state
-            weight = (
-                dr.maximum(1 - distance / dr.square(self._reach), 0) ** SHARPNESS
-                * dr.maximum(cosine, 0) ** ALIGNMENT
-            )
+            weight = self._weight(distance, cosine)
             return (
                 total + weight * dr.gather(mi.Color3f, values, sample, weight > 0),
                 weights + weight,
@@ -124,6 +123,45 @@ class SampleLocator:
         total, weights = self._visit(position, normal, active, (mi.Color3f(0), mi.Float(0)), visit)
         found = weights > 1e-12
         return dr.select(found, total / weights, 0), found
+
+    def picked(self, position, normal, active, random):
+        """One of the samples around places, chosen by the weights of `interpolated`.
+
+        Parameters
+        ----------
+        position, normal, active :
+            As for `nearest`.
+        random : mi.Float
+            Uniform in 0…1; each sample draws a number of its own from it.
+
+        Returns
+        -------
+        index : mi.UInt32
+        found : mi.Bool
+        """
+        import drjit as dr
+
+        mi = mitsuba()
+        seed = mi.UInt32(random * (1 << 24))
+
+        def visit(state, sample, place, distance, cosine):
+            chosen, weights = state
+            weight = self._weight(distance, cosine)
+            weights += weight
+            # reservoir sampling: each stays the chosen one with its share of the weights
+            taken = mi.sample_tea_float32(sample, seed) * weights < weight
+            return dr.select(taken, sample, chosen), weights
+
+        start = (mi.UInt32(0), mi.Float(0))
+        index, weights = self._visit(position, normal, active, start, visit)
+        return index, weights > 1e-12
+
+    def _weight(self, distance, cosine):
+        """Weight of a sample at a squared distance, its normal at an angle."""
+        import drjit as dr
+
+        near = dr.maximum(1 - distance / dr.square(self._reach), 0) ** SHARPNESS
+        return near * dr.maximum(cosine, 0) ** ALIGNMENT
 
     def _visit(self, position, normal, active, state, visit):
         """Fold `visit(state, sample, its place, squared distance, cosine between normals)` over the
@@ -152,6 +190,41 @@ class SampleLocator:
 
         _, *state = dr.while_loop((first, *state), lambda entry, *_: entry < last, step)
         return state
+
+
+class SpacedLocator(Locator):
+    """Finds the samples around hits by distance and normal (Meshless PRT, section 5).
+
+    Parameters
+    ----------
+    scene : Scene
+        The scene in which hits occur.
+    points : Points
+    radius : float
+        Metres that they keep from each other.
+    """
+
+    def __init__(self, scene, points, radius):
+        self._surfaces = scene.surfaces
+        self._samples = SampleLocator(points.positions, points.normals, radius)
+
+    def interpolated(self, values, pi, si, ray, active):
+        """See `Locator.interpolated`."""
+        normals, _, reflects = facing(si, ray, self._surfaces)
+        return self._samples.interpolated(values, si.p, normals.shading, active & reflects)
+
+    def picked(self, pi, si, ray, active, random):
+        """See `Locator.picked`."""
+        normals, _, reflects = facing(si, ray, self._surfaces)
+        return self._samples.picked(si.p, normals.shading, active & reflects, random)
+
+    def nearest(self, pi, si, ray, active, seen_from=None):
+        """See `Locator.nearest`."""
+        import drjit as dr
+
+        normals, _, reflects = facing(si, ray, self._surfaces)
+        index, distance = self._samples.nearest(si.p, normals.shading, active & reflects, seen_from)
+        return index, active & reflects & dr.isfinite(distance)
 
 
 def _lists(positions, low, edge, size, reach):

@@ -1,13 +1,12 @@
-"""Meshless sample points and their clusters (Meshless PRT, section 4.1)."""
-
-from dataclasses import dataclass
+"""Meshless sample points (Meshless PRT, section 4.1)."""
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from ..errors import SettingsError
-from .lattice import Patches
-from .particles import cross_surfaces, free_places, trace_particles
+from .clusters import make_clusters
+from .layout import Spacing
+from .particles import cross_surfaces, trace_particles
 from .points import Points
 from .sample_locator import SampleLocator
 from .thinning import embedded, thin
@@ -17,69 +16,28 @@ CROSSINGS = 16  # random places on surfaces for each sample, that measure its ar
 COVERED = 1.25  # radii from a sample up to which a surface counts as reachable
 MOST_SAMPLES = 1_000_000
 _MOST_BLOCKS = 512
-_FREE_CANDIDATES = 8  # for each place in free space that stays
 
 
-@dataclass(frozen=True, eq=False)
-class Samples:
-    """Sample points of a scene, ordered by cluster.
-
-    Parameters
-    ----------
-    points : Points
-        Without patches.
-    starts : (c + 1,) int64
-        Cluster i holds the points starts[i] … starts[i + 1] − 1.
-    roots : (c,) int64
-        The point in the middle of each cluster.
-    radius : float
-        Metres that samples keep from each other, less on curved surfaces.
-    """
-
-    points: Points
-    starts: np.ndarray
-    roots: np.ndarray
-    radius: float
-
-    def __len__(self):
-        return len(self.points)
-
-    @property
-    def clusters(self):
-        """Slices of points."""
-        return [slice(int(a), int(b)) for a, b in zip(self.starts, self.starts[1:])]
-
-    @property
-    def labels(self):
-        """Cluster of each point, (n,) int32."""
-        return np.repeat(np.arange(len(self.roots), dtype=np.int32), np.diff(self.starts))
-
-    def locator(self):
-        """A SampleLocator of these points."""
-        return SampleLocator(self.points.positions, self.points.normals, self.radius)
-
-
-def scatter_samples(scene, count, cluster_size, examples, seed=0):
-    """Samples in blue noise on all surfaces that light can reach, in clusters, and places for
-    lights between them.
+def scatter_points(scene, count, clusters, seed=0):
+    """Samples in blue noise on all surfaces that light can reach, ordered by cluster.
 
     Parameters
     ----------
     scene : Scene
     count : int
         Samples.
-    cluster_size : int
-        Samples in a cluster, on average.
-    examples : int
-        Places in free space.
+    clusters : int
+        Number of clusters.
     seed : int
 
     Returns
     -------
-    samples : Samples
-        `points.report` holds radius, reachable_area (m², the sum of the points' areas) and
-        coverage: the share of the reachable area that is within a radius of a sample.
-    places : (examples, 3) float32
+    points : Points
+        `report` holds radius, reachable_area (m², the sum of the points' areas) and coverage: the
+        share of the reachable area that is within a radius of a sample.
+    clusters : Clusters
+    flights : (k, 2, 3) float32
+        Flights of particles through the space between surfaces, see `particles.example_places`.
 
     Raises
     ------
@@ -98,11 +56,9 @@ def scatter_samples(scene, count, cluster_size, examples, seed=0):
             " from each other"
         )
     hits = hits.at(chosen)
-    roots, starts, order = _clusters(hits, max(1, round(count / cluster_size)), seed)
-    hits = hits.at(order)
+    found = make_clusters(hits, clusters, seed)
+    hits = hits.at(found.order)
     areas, coverage = _areas(scene, hits, radius, seed)
-    places = free_places(flights, _FREE_CANDIDATES * examples, seed)
-    places = places[thin(places, None, examples, seed, dimension=3)[0]]
     points = Points(
         hits.positions,
         hits.normals,
@@ -112,28 +68,12 @@ def scatter_samples(scene, count, cluster_size, examples, seed=0):
         areas.astype(np.float32),
         hits.uv,
         hits.surface,
-        Patches(np.zeros((0, 2), np.int32), *(np.zeros(0, np.int32) for _ in range(3))),
+        np.zeros(len(hits), bool),
+        Spacing(radius),
         tuple({"name": s.name, "kind": s.kind} for s in scene.surfaces),
         {"radius": radius, "reachable_area": float(areas.sum()), "coverage": coverage},
     )
-    return Samples(points, starts, roots, radius), places
-
-
-def _clusters(hits, count, seed):
-    """Roots (c,) as positions in the new order, starts (c + 1,), and the order of points by
-    cluster.
-
-    Roots are thinned like samples, at a larger radius, and each sample belongs to the nearest. No
-    sample is farther from its root than about the radius, so that its normal is within 60° of the
-    root's: no cluster holds both sides of a wall. (With fewer clusters than there are such
-    directions, six in a room, that cannot be.)
-    """
-    roots, radius = thin(hits.positions, hits.normals, count, seed)
-    tree = cKDTree(embedded(hits.positions[roots], hits.normals[roots], radius))
-    label = tree.query(embedded(hits.positions, hits.normals, radius))[1]
-    order = np.argsort(label, kind="stable")
-    starts = np.searchsorted(label[order], np.arange(count + 1))
-    return np.argsort(order)[roots], starts, order
+    return points, found.in_order(), flights
 
 
 def _areas(scene, hits, radius, seed):

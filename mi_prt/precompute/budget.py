@@ -1,14 +1,14 @@
-"""What a precomputation takes of memory, told before it starts."""
+"""What a precomputation of distant transport takes of memory, found out before it starts."""
 
 import numpy as np
 
-from ..basis.bases import coefficient_bytes, fit_bytes
+from ..basis.basis import BASES
 from ..basis.total import PROBES
 from ..errors import SettingsError
 from ..system.memory import resident_bytes
 from ..system.parallel import BLOCK_ROWS
 from ..system.runtime import thread_count
-from ..transport.direct import LANES
+from ..transport.bits import LANES
 from ..transport.interreflection import COLUMNS
 from .reflections import GREY, MOST_RAYS
 
@@ -21,9 +21,6 @@ INDIRECT_LANE_BYTES = 400
 # while blocked directions are drawn, for each of those that there are and of those drawn
 CHOICE_BYTES, CHOSEN_BYTES = 30, 60
 SUMMED_TERMS, SOLVED_TERMS = 3, 9  # vectors that a series, and a Krylov method, work on at a time
-# of the stored coefficients in memory, where blocks are put together: indices are wider there; else
-# 2
-COPIES = {"haar": 3.2}
 
 
 def held_coefficient_bytes(settings, points, directions, components, channels):
@@ -36,31 +33,26 @@ def held_coefficient_bytes(settings, points, directions, components, channels):
     channels : 1 or 3
         Of total transport; see `expected_channels`.
     """
-    size = coefficient_bytes(
-        settings.basis, points, directions, components, settings.rays_per_direction
-    )
-    held = COPIES.get(settings.basis, 2) * size
-    if settings.bounces != 0:
+    basis = BASES[settings.basis]
+    size = basis.coefficient_bytes(points, directions, components, settings.rays_per_direction)
+    held = basis.copies * size
+    if settings.distant_bounces != 0:
         size = size * (components + PROBES) // max(components, 1)
         # Direct transport; two estimates of indirect transport, and their difference or the rows
         # they come from; what is summed of some columns.
-        columns = (
-            4
-            * points
-            * channels
-            * (SUMMED_TERMS if settings.bounces != "auto" else SOLVED_TERMS)
-            * min(COLUMNS, components + 1)
-        )
+        terms = SUMMED_TERMS if settings.distant_bounces != "auto" else SOLVED_TERMS
+        columns = 4 * points * channels * terms * min(COLUMNS, components + 1)
         held = size + (3 if settings.indirect == "solve" else 4) * size * channels + columns
     return int(held)
 
 
 def expected_channels(points, settings):
     """Colour channels of total transport, as the points' own albedo tells."""
-    return 3 if settings.bounces != 0 and np.ptp(points.albedo, axis=1).max(initial=0) > GREY else 1
+    coloured = np.ptp(points.albedo, axis=1).max(initial=0) > GREY
+    return 3 if settings.distant_bounces != 0 and coloured else 1
 
 
-class Room:
+class Budget:
     """What fits into the memory that a run may take.
 
     Parameters
@@ -97,7 +89,7 @@ class Room:
         components = target.components or 0
         self.channels = expected_channels(points, settings)
         blocks = s * (6 * rays + 12)
-        if settings.bounces != 0 and settings.indirect == "solve":
+        if settings.distant_bounces != 0 and settings.indirect == "solve":
             drawn = MOST_RAYS if settings.paths_per_point == "auto" else settings.paths_per_point
             blocks = max(blocks, CHOICE_BYTES * s // 2 * rays + CHOSEN_BYTES * drawn)
         blocks *= BLOCK_ROWS * thread_count()
@@ -106,7 +98,8 @@ class Room:
             + blocks
             + held_coefficient_bytes(settings, n, s, components, self.channels)
         )
-        needed = fixed + fit_bytes(settings.basis, n, s, components) + LANE_BYTES * LEAST_LANES
+        fit = BASES[settings.basis].fit_bytes(n, s, components)
+        needed = fixed + fit + LANE_BYTES * LEAST_LANES
         if limit - held < needed:
             raise SettingsError(
                 f"memory {limit / 1e6:,.0f} MB is too little: the scene holds {held / 1e6:,.0f} MB"

@@ -49,12 +49,9 @@ class IndirectTransport:
 
     Parameters
     ----------
-    scene : Scene
-    points : Points
-    buried : (n,) bool
+    job : Job
     transport : DirectTransport
     directions : DirectionLattice
-    settings : Settings
     carrier : Carrier
     direct : (n, m + p) float32
         Direct transport in it.
@@ -64,31 +61,36 @@ class IndirectTransport:
         Most rays of one wavefront.
     """
 
-    scene: object
-    points: object
-    buried: np.ndarray
+    job: object
     transport: object
     directions: object
-    settings: object
     carrier: object
     direct: np.ndarray
     blocked: np.ndarray
     lanes: int
 
+    @property
+    def _points(self):
+        return self.job.points
+
+    @property
+    def _settings(self):
+        return self.job.settings
+
     def _demand(self):
         """Find out what the scene calls for, by a few rays from some of its points; a Demand."""
-        settings = self.settings
-        seeing = np.flatnonzero((self.blocked > 0) & ~self.buried)
+        settings = self._settings
+        seeing = np.flatnonzero((self.blocked > 0) & ~self._points.buried)
         few = np.sort(np.random.default_rng(settings.seed).permutation(seeing)[:PILOT_POINTS])
         hops = self._hop_sampler(PILOT_RAYS).rows(few)
         seen = hops["point"] != NOTHING
         coloured = any(
             np.ptp(x, axis=-1).max(initial=0) > GREY
-            for x in (self.points.albedo, hops["albedo"][seen])
+            for x in (self._points.albedo, hops["albedo"][seen])
         )
-        if settings.bounces == "auto":
+        if settings.distant_bounces == "auto":
             check_ending(
-                max(float(x.max(initial=0.0)) for x in (self.points.albedo, hops["albedo"][seen]))
+                max(float(x.max(initial=0.0)) for x in (self._points.albedo, hops["albedo"][seen]))
             )
         rays = settings.paths_per_point
         if rays == "auto":
@@ -108,7 +110,9 @@ class IndirectTransport:
                 * len(seeing)
             )
             wanted = noise / max(
-                NOISE_TOLERANCE**2 * float(np.sum(np.square(self.direct[~self.buried, :m]))), 1e-300
+                NOISE_TOLERANCE**2
+                * float(np.sum(np.square(self.direct[~self._points.buried, :m]))),
+                1e-300,
             )
             rays = 1 << int(np.ceil(np.log2(np.clip(wanted, LEAST_RAYS, MOST_RAYS))))
         return Demand(rays, 3 if coloured else 1)
@@ -125,20 +129,12 @@ class IndirectTransport:
 
     def _path_halves(self, few):
         """The same of light after all reflections, by paths."""
-        sampler = self._path_sampler(Demand(PILOT_RAYS, 1), self.points.at(few))
+        sampler = self._path_sampler(Demand(PILOT_RAYS, 1), self._points.at(few))
         halves, _ = _unpacked(np.concatenate(list(sampler.blocks())), 1, self.direct.shape[1])
         return halves[:, 0]
 
-    def coefficients(self, workspace, trace, progress):
-        """Coefficients of indirect transport.
-
-        Parameters
-        ----------
-        workspace : Workspace
-            Keeps the rays.
-        trace : callable(stage, sampler, rows)
-            Fills a RowFile.
-        progress : callable(stage, done, total, detail)
+    def coefficients(self):
+        """Coefficients of indirect transport; the job's workspace keeps the rays.
 
         Returns
         -------
@@ -154,15 +150,14 @@ class IndirectTransport:
             If any number of reflections is wanted and they do not end.
         """
         demand = self._demand()
-        halves, split = (self._solved if self.settings.indirect == "solve" else self._traced)(
-            demand, workspace, trace, progress
-        )
+        estimate = {"solve": self._solved, "paths": self._traced}[self._settings.indirect]
+        halves, split = estimate(demand)
         if split.bounces == 0:
             return None, 0.0, direct_report(split.energy[0])
-        m, kept = len(self.carrier.span), ~self.buried
+        m, kept = len(self.carrier.span), ~self._points.buried
         growth = self._growth([half[..., m:] for half in halves], kept)
         coefficients, noise, passed = combined(
-            [half[..., :m] for half in halves], kept, self.settings.denoise
+            [half[..., :m] for half in halves], kept, self._settings.denoise
         )
         total = float(np.linalg.norm(self.direct[kept, :m])) * demand.channels**0.5
         return (
@@ -188,16 +183,16 @@ class IndirectTransport:
         after = sum(float(np.vdot(lost + a[kept], lost + b[kept])) for a, b in zip(*halves))
         return max(after, 0.0) / max(float(np.vdot(lost, lost)), 1e-300)
 
-    def _solved(self, demand, workspace, trace, progress):
+    def _solved(self, demand):
         """Two independent estimates (c, n, m + p) by a series of hops, None where there is no
         light; and the BounceSplit.
         """
         sampler = self._hop_sampler(demand.rays)
         m, channels = self.direct.shape[1], demand.channels
-        with closing(workspace.rows("hops", len(self.points), sampler.row_bytes)) as rays:
-            trace("indirect", sampler, rays)
+        with closing(self._rows("hops", sampler.row_bytes)) as rays:
+            self.job.trace("indirect", sampler, rays)
             hops = Hops(rays, self.blocked)
-            weights = surface_shares(self.points, self.buried)
+            weights = surface_shares(self._points, self._points.buried)
             split = split_by_bounces(hops, 1 - self.blocked, weights, channels, self._most)
             if split.bounces == 0:
                 return None, split
@@ -208,37 +203,39 @@ class IndirectTransport:
                     self.direct,
                     channels,
                     summed,
-                    lambda done: progress("reflections", i * m + done, 2 * m, ""),
+                    lambda done: self.job.progress("reflections", i * m + done, 2 * m, ""),
                 )
                 for i, half in enumerate(hops.halves())
             ]
         return halves, split if summed else replace(split, left=0.0)
 
-    def _traced(self, demand, workspace, trace, progress):
+    def _traced(self, demand):
         """The same by paths."""
-        sampler = self._path_sampler(demand, self.points)
+        sampler = self._path_sampler(demand, self._points)
         m = self.direct.shape[1]
         # What is kept are coefficients, which mean nothing in another span.
         name = f"paths-{zlib.crc32(np.ascontiguousarray(self.carrier.span.vectors)):08x}"
-        with closing(workspace.rows(name, len(self.points), sampler.row_bytes(m))) as rows:
-            trace("indirect", sampler, rows)
+        with closing(self._rows(name, sampler.row_bytes(m))) as rows:
+            self.job.trace("indirect", sampler, rows)
             halves, energies = _unpacked(rows[:], demand.channels, m)
-        weights = surface_shares(self.points, self.buried)
+        weights = surface_shares(self._points, self._points.buried)
         reflected = (weights @ energies).tolist()
         while reflected and reflected[-1] == 0:
             reflected.pop()
         return halves, BounceSplit((float((1 - self.blocked) @ weights), *reflected), 0.0)
 
+    def _rows(self, name, row_bytes):
+        return self.job.workspace.rows(name, len(self._points), row_bytes)
+
     @property
     def _most(self):
-        return None if self.settings.bounces == "auto" else self.settings.bounces
+        return None if self._settings.distant_bounces == "auto" else self._settings.distant_bounces
 
     def _hop_sampler(self, rays):
-        seed = self.settings.seed
+        seed = self._settings.seed
         return HopSampler(
-            self.scene,
-            self.points,
-            self.buried,
+            self.job.scene,
+            self._points,
             self.transport,
             self.directions,
             rays,
@@ -247,9 +244,9 @@ class IndirectTransport:
         )
 
     def _path_sampler(self, demand, points):
-        seed, encode = self.settings.seed, self.carrier.encode
+        seed, encode = self._settings.seed, self.carrier.encode
         return PathSampler(
-            self.scene,
+            self.job.scene,
             points,
             self.directions,
             demand.rays,

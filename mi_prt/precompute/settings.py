@@ -1,147 +1,263 @@
-"""What a precomputation is asked to do."""
+"""What a precomputation is asked to do: one table of options, from which checks, command line and
+documentation are made.
+"""
 
-from dataclasses import dataclass, fields
+from dataclasses import make_dataclass
 
-import numpy as np
-
-from ..basis.bases import check_basis, check_components, default_components, most_components
+from ..basis.basis import BASES
 from ..basis.target import Target
 from ..directions import parse_directions
 from ..directions.hemisphere import Hemisphere
 from ..errors import SettingsError
+from .options import Choice, Flag, Integer, Option, Real
 
 DEFAULT_VARIANCE = 0.95
-MAX_RAYS_PER_DIRECTION = 64
 MAX_BOUNCES = 10_000
 MAX_PATHS = 1 << 16
-INDIRECT = ("solve", "paths")
-# bases whose coefficients are picked from, or are, rows of direct transport
-DIRECT_ONLY = ("haar", "none")
-_INTEGERS = {  # settings that are integers, and what else they may be
-    "coefficients": (None, "auto"),
-    "rays_per_direction": (),
-    "bounces": (None, "auto"),
-    "paths_per_point": ("auto",),
-    "seed": (),
-}
+MAX_POINTS = 1_000_000
+TRANSPORTS = ("distant", "own", "local")
+POINTS = ("vertices", "samples")
+QUANTIZATIONS = ("16", "none")
 
 
-@dataclass(frozen=True)
-class Settings:
-    """What a precomputation is asked to do; stored with the asset.
+class _Lattice(Option):
+    """A direction lattice."""
 
-    Parameters
-    ----------
-    directions : str
-        Direction lattice: ``cubemap:N``, ``latlong:WxH`` or ``halton:N``.
-    basis : str
-        ``pca``, ``sh`` (spherical harmonics), ``haar`` (the best wavelets of each point),
-        ``haar-shared`` (the same for all points) or ``none`` (transport as it was sampled).
-    coefficients : int, 'auto' or None
-        Components of the basis. None takes 48 (49 harmonics), or the rank of the transport where
-        that is lower; an explicit number above the rank is refused; 'auto' takes as few as capture
-        `variance`.
-    variance : float or None
-        Share of the transport's variance that 'auto' captures, 0.95 by default.
-    edge_length : 'auto' or float
-        Metres to which coarse faces and analytic shapes are tessellated.
-    rays_per_direction : int
-        Rays in each cell of the lattice, 1…64.
-    bounces : int, 'auto' or None
-        Most reflections of light on its way to a point: 0 is direct light alone, 'auto' as many as
-        it takes until less than 0.1 % of the light is left (none where no point sees another). None
-        is 'auto', and 0 for the bases `haar` and `none`, which hold direct transport only.
-    indirect : str
-        How reflections are computed: ``solve`` (one traced hop between points, and a series in
-        coefficient space) or ``paths`` (path tracing from each point: unbiased, and noisier).
-    paths_per_point : int or 'auto'
-        Rays (`solve`) or paths (`paths`) from each point; 'auto' takes so many, 64…1024, that their
-        noise is about 1 % of the transport, as a pilot tells.
-    denoise : bool
-        Whether components of indirect transport are scaled by the share of their variance that is
-        signal.
-    seed : int
+    def check(self, value):
+        """See `Option.check`."""
+        return str(parse_directions(value))
 
-    Raises
-    ------
-    SettingsError
-        If a value is out of range or values contradict each other.
-    """
 
-    directions: str = "cubemap:32"
-    basis: str = "pca"
-    coefficients: int | str | None = None
-    variance: float | None = None
-    edge_length: str | float = "auto"
-    rays_per_direction: int = 1
-    bounces: int | str | None = None
-    indirect: str = "solve"
-    paths_per_point: int | str = "auto"
-    denoise: bool = True
-    seed: int = 0
+class _Transports(Option):
+    """`auto`, or names with commas between them."""
+
+    def check(self, value):
+        """See `Option.check`."""
+        if value == "auto":
+            return value
+        names = value.split(",") if isinstance(value, str) else list(value)
+        unknown = [name for name in names if name not in TRANSPORTS]
+        if unknown or not names or len(set(names)) < len(names):
+            raise SettingsError(
+                f"transports '{value}' must be auto, or some of {', '.join(TRANSPORTS)}, each once"
+            )
+        return ",".join(name for name in TRANSPORTS if name in names)
+
+
+AUTO = ("auto",)
+OPTIONS = (
+    _Transports(
+        "transports",
+        "auto",
+        "What to precompute: distant (sky, sun, maps), own (the scene's lamps, exact), local (lamps"
+        " that move), with commas; auto: distant and own, as the scene's emitters call for.",
+        "auto|LIST",
+    ),
+    Choice(
+        "points",
+        "auto",
+        "Where: vertices of tessellated surfaces, or meshless samples.",
+        "auto|vertices|samples",
+        among=("auto", *POINTS),
+    ),
+    Integer(
+        "bounces",
+        None,
+        "Reflections of light [auto: until 0.1 % is left; with the bases haar and none: 0].",
+        "B|auto",
+        most=MAX_BOUNCES,
+        others=(None, "auto"),
+    ),
+    Integer("seed", 0, "Same seed, same result.", "N", most=(1 << 31) - 1),
+    Choice(
+        "quantize",
+        "16",
+        "Numbers of 16 bits, or float32, of lamps and of light that moves.",
+        "16|none",
+        among=QUANTIZATIONS,
+    ),
+    # --- points
+    Real(
+        "edge_length",
+        "auto",
+        "Coarse faces are tessellated down to this.",
+        "auto|METRES",
+        "vertices",
+        others=AUTO,
+    ),
+    Integer("count", 45_000, "Samples.", "N", "samples", least=1, most=MAX_POINTS),
+    # --- light from afar
+    _Lattice(
+        "directions",
+        "cubemap:32",
+        "cubemap:N (6·N·N directions), latlong:WxH or halton:N.",
+        "LATTICE",
+        "distant",
+    ),
+    Choice(
+        "basis",
+        "pca",
+        "pca, sh, haar (best wavelets of each point), haar-shared or none.",
+        "KIND",
+        "distant",
+        among=BASES,
+    ),
+    Integer(
+        "coefficients",
+        None,
+        "Components of the basis [48 (sh: 49), or the rank if lower].",
+        "D|auto",
+        "distant",
+        others=(None, "auto"),
+    ),
+    Real(
+        "variance",
+        None,
+        f"Share of the transport that --coefficients auto captures [{DEFAULT_VARIANCE}].",
+        "SHARE",
+        "distant",
+        others=(None,),
+    ),
+    Integer(
+        "rays_per_direction",
+        1,
+        "Rays in each cell; 4 antialias shadows.",
+        "R",
+        "distant",
+        least=1,
+        most=64,
+    ),
+    Choice(
+        "indirect",
+        "solve",
+        "Reflections from point to point, or by unbiased path tracing.",
+        "solve|paths",
+        "distant",
+        among=("solve", "paths"),
+    ),
+    Integer(
+        "paths_per_point",
+        "auto",
+        "Rays for reflections of distant light; auto: noise of about 1 % of the transport.",
+        "N|auto",
+        "distant",
+        least=2,
+        most=MAX_PATHS,
+        others=AUTO,
+    ),
+    Flag(
+        "denoise",
+        True,
+        "Scale components of reflected light by the share of their variance that is signal.",
+        "",
+        "distant",
+    ),
+    Flag(
+        "keep_direct",
+        False,
+        "Keep direct distant light apart from total light, for --component.",
+        "",
+        "distant",
+    ),
+    # --- the scene's own lamps
+    Real(
+        "lamp_tolerance",
+        0.01,
+        "Noise of direct light of lamps that shadow rays stop at, relative.",
+        "SHARE",
+        "own",
+        least=1e-4,
+        below=1,
+    ),
+    Integer(
+        "lamp_rays",
+        256,
+        "Rays from each point for reflections of lamps: a multiple of 4.",
+        "N",
+        "own",
+        least=4,
+        most=MAX_PATHS,
+    ),
+    # --- lamps that move
+    Integer(
+        "cluster_size",
+        1000,
+        "Points in a cluster, on average.",
+        "N",
+        "local",
+        least=1,
+        most=MAX_POINTS,
+    ),
+    Integer(
+        "depth_directions",
+        2016,
+        "Of each point's depth buffer: a product of two numbers that differ by half at most.",
+        "N",
+        "local",
+        least=16,
+        most=1 << 16,
+    ),
+    Integer(
+        "depth_coefficients",
+        50,
+        "Components of depth buffers on a cluster.",
+        "D",
+        "local",
+        least=1,
+        most=1 << 12,
+    ),
+    Integer(
+        "example_lights",
+        1000,
+        "Lights that the basis of direct light is made from.",
+        "N",
+        "local",
+        least=1,
+        most=100_000,
+    ),
+    Integer(
+        "transfer_coefficients",
+        32,
+        "Components of direct light on a cluster.",
+        "D",
+        "local",
+        least=1,
+        most=1 << 10,
+    ),
+    Real(
+        "transfer_error",
+        0.02,
+        "Share of indirect light that may be lost by leaving small parts of the transfer out.",
+        "SHARE",
+        "local",
+        least=0,
+        below=1,
+    ),
+)
+BY_NAME = {option.name: option for option in OPTIONS}
+
+
+class _Settings:
+    """What all settings do; the fields are those of `OPTIONS`."""
 
     def __post_init__(self):
-        lattice = parse_directions(self.directions)
-        plain = {"directions": str(lattice)}
-        check_basis(self.basis)
-        for name, others in _INTEGERS.items():
-            value = getattr(self, name)
-            if any(
-                value is other or (isinstance(value, str) and value == other) for other in others
-            ):
-                continue
-            if isinstance(value, bool) or not isinstance(value, int | np.integer):
-                raise SettingsError(
-                    f"{name} must be an integer{' or auto' if others else ''}, got {value!r}"
-                )
-            plain[name] = int(value)
-        for name in ("variance", "edge_length"):
-            value = getattr(self, name)
-            if value is not None and not (
-                name == "edge_length" and isinstance(value, str) and value == "auto"
-            ):
-                plain[name] = _number(name, value)
-        # Plain values of one type each: they are stored, and compared when a run is continued.
-        for name, value in plain.items():
-            object.__setattr__(self, name, value)
-        if not 1 <= self.rays_per_direction <= MAX_RAYS_PER_DIRECTION:
+        for option in OPTIONS:
+            object.__setattr__(self, option.name, option.check(getattr(self, option.name)))
+        if self.paths_per_point != "auto" and self.paths_per_point % 2:
             raise SettingsError(
-                f"rays per direction must be 1…{MAX_RAYS_PER_DIRECTION}, got"
-                f" {self.rays_per_direction}"
+                f"paths per point must be auto or an even number, got {self.paths_per_point}"
             )
-        if self.seed < 0:
-            raise SettingsError(f"seed must be ≥ 0, got {self.seed}")
-        self._check_coefficients(lattice)
-        self._check_bounces()
-
-    def _check_bounces(self):
-        if self.bounces is None:
-            object.__setattr__(self, "bounces", 0 if self.basis in DIRECT_ONLY else "auto")
-        if self.bounces != "auto" and not 0 <= self.bounces <= MAX_BOUNCES:
-            raise SettingsError(f"bounces must be auto or 0…{MAX_BOUNCES}, got {self.bounces}")
-        if self.bounces != 0 and self.basis in DIRECT_ONLY:
+        if self.lamp_rays % 4:
+            raise SettingsError(f"lamp rays must be a multiple of 4, got {self.lamp_rays}")
+        Hemisphere(self.depth_directions)
+        self._check_coefficients()
+        if not BASES[self.basis].holds_reflections and self.bounces not in (None, 0):
             raise SettingsError(
                 f"the basis {self.basis} holds direct transport only, got bounces {self.bounces}:"
                 " use bounces 0, or the basis pca, sh or haar-shared"
             )
-        if self.indirect not in INDIRECT:
-            raise SettingsError(
-                f"indirect '{self.indirect}' is not known: use {' or '.join(INDIRECT)}"
-            )
-        if not isinstance(self.denoise, bool):
-            raise SettingsError(f"denoise must be true or false, got {self.denoise!r}")
-        paths = self.paths_per_point
-        if paths != "auto" and (not 2 <= paths <= MAX_PATHS or paths % 2):
-            raise SettingsError(
-                f"paths per point must be auto or an even number 2…{MAX_PATHS:,}, got {paths}"
-            )
 
-    def _check_coefficients(self, lattice):
-        if self.basis == "none" and self.coefficients is not None:
-            raise SettingsError(
-                f"the basis none keeps all directions, so coefficients {self.coefficients} mean"
-                " nothing: leave them out"
-            )
+    def _check_coefficients(self):
         if self.coefficients == "auto":
             if self.variance is None:
                 object.__setattr__(self, "variance", DEFAULT_VARIANCE)
@@ -151,124 +267,47 @@ class Settings:
                 f"variance {self.variance:g} needs coefficients auto, got"
                 f" {self.coefficients or 'the default'}"
             )
-        elif self.coefficients is not None and self.coefficients < 0:
-            raise SettingsError(f"coefficients must be ≥ 0, got {self.coefficients}")
-        check_components(
-            self.basis, lattice, None if self.coefficients == "auto" else self.coefficients
-        )
+        BASES[self.basis].check(parse_directions(self.directions), self.coefficients)
+
+    @property
+    def distant_bounces(self):
+        """Most reflections of distant light: a number or 'auto'."""
+        if self.bounces is None:
+            return "auto" if BASES[self.basis].holds_reflections else 0
+        return self.bounces
+
+    @property
+    def lamp_bounces(self):
+        """Most reflections of light of lamps: a number or 'auto'."""
+        return "auto" if self.bounces is None else self.bounces
 
     def target(self, points):
         """What the basis of so many points is asked for, a Target."""
         if self.variance is not None:
             return Target(variance=self.variance)
-        directions = parse_directions(self.directions)
+        basis, directions = BASES[self.basis], parse_directions(self.directions)
         if self.coefficients is None:
-            return Target(default_components(self.basis, directions, points))
-        largest = most_components(self.basis, directions, points)
+            return Target(basis.default_components(directions, points))
+        largest = basis.most_components(directions, points)
         if self.coefficients > largest:
             raise SettingsError(
-                f"{self.coefficients} coefficients are above the rank of the transport: {points:,}"
-                f" points and {len(directions):,} directions allow at most {largest}"
+                f"{self.coefficients} coefficients are above the rank of the transport:"
+                f" {points:,} points and {len(directions):,} directions allow at most {largest}"
             )
-        return Target(int(self.coefficients))
+        return Target(self.coefficients)
 
 
-def _number(name, value):
-    try:
-        return float(value)
-    except (TypeError, ValueError):
-        auto = "neither 'auto' nor" if name == "edge_length" else "not"
-        raise SettingsError(f"{name} {value!r} is {auto} a number") from None
-
-
-QUANTIZATIONS = ("16", "none")
-
-
-@dataclass(frozen=True)
-class MeshlessSettings:
-    """What a precomputation for local lights is asked to do (Meshless PRT); stored with the asset.
-
-    Parameters
-    ----------
-    count : int
-        Sample points, 1…1,000,000.
-    cluster_size : int
-        Samples in a cluster, on average.
-    depth_directions : int
-        Of each sample's depth buffer: a product of two numbers that differ by half at most.
-    depth_coefficients : int
-        Components of the depth buffers of each cluster.
-    example_lights : int
-        Point lights that the basis of direct light is made from.
-    transfer_coefficients : int
-        Components of direct light on each cluster.
-    transfer_error : float
-        Relative RMS error of indirect irradiance that may be made by dropping small parts of the
-        transfer matrices; 0 drops none.
-    quantize : '16' or 'none'
-        Bits of an integer in the place of float32.
-    bounces : int or 'auto'
-        Most reflections of light on its way to a point; 0 is direct light alone, 'auto' any number.
-    seed : int
-
-    Raises
-    ------
-    SettingsError
-        If a value is out of range.
-    """
-
-    count: int = 45_000
-    cluster_size: int = 1000
-    depth_directions: int = 2016
-    depth_coefficients: int = 50
-    example_lights: int = 1000
-    transfer_coefficients: int = 32
-    transfer_error: float = 0.02
-    quantize: str = "16"
-    bounces: int | str = "auto"
-    seed: int = 0
-
-    def __post_init__(self):
-        most = {
-            "count": (1, 1_000_000),
-            "cluster_size": (1, 1_000_000),
-            "depth_directions": (16, 1 << 16),
-            "depth_coefficients": (1, 1 << 12),
-            "example_lights": (1, 100_000),
-            "transfer_coefficients": (1, 1 << 10),
-            "bounces": (0, MAX_BOUNCES),
-            "seed": (0, (1 << 31) - 1),
-        }
-        for name, (low, high) in most.items():
-            value = getattr(self, name)
-            words = name.replace("_", " ")
-            if name == "bounces" and value in (None, "auto"):
-                object.__setattr__(self, name, "auto")
-                continue
-            if (
-                isinstance(value, bool)
-                or not isinstance(value, int | np.integer)
-                or not low <= value <= high
-            ):
-                raise SettingsError(
-                    f"{words} must be an integer"
-                    f" {low}…{high:,}{' or auto' if name == 'bounces' else ''}, got {value!r}"
-                )
-            object.__setattr__(self, name, int(value))
-        Hemisphere(self.depth_directions)
-        error = _number("transfer_error", self.transfer_error)
-        if not 0 <= error < 1:
-            raise SettingsError(
-                f"transfer error must be at least 0 and below 1, got {self.transfer_error}"
-            )
-        object.__setattr__(self, "transfer_error", error)
-        object.__setattr__(self, "quantize", str(self.quantize))
-        if self.quantize not in QUANTIZATIONS:
-            raise SettingsError(
-                f"quantize '{self.quantize}' is not known: use {' or '.join(QUANTIZATIONS)}"
-            )
-
-
-def names_of(settings):
-    """Names of the fields of a class of settings."""
-    return [field.name for field in fields(settings)]
+Settings = make_dataclass(
+    "Settings",
+    [(option.name, object, option.default) for option in OPTIONS],
+    bases=(_Settings,),
+    frozen=True,
+    namespace={
+        "__doc__": "What a precomputation is asked to do; stored with the asset.\n\n"
+        "Parameters\n----------\n"
+        + "\n".join(f"{o.name} : {o.metavar or 'bool'}\n    {o.help}" for o in OPTIONS)
+        + "\n\nRaises\n------\nSettingsError\n    If a value is out of range or values contradict"
+        " each other.",
+        "__module__": __name__,
+    },
+)

@@ -11,7 +11,7 @@ from .integrator import integrator_for
 MAX_PIXELS = 1 << 26
 
 
-def render_image(asset, mi_scene, sensor, spp=64, seed=0, irradiance=None, pixel_light=None):
+def render_image(asset, mi_scene, sensor, spp=64, seed=0, irradiance=None, direct="points"):
     """Image of a scene lit from an asset.
 
     Parameters
@@ -24,15 +24,16 @@ def render_image(asset, mi_scene, sensor, spp=64, seed=0, irradiance=None, pixel
     seed : int
     irradiance : (n, 3), optional
         W/m² at the asset's points; by default that under the scene's emitters.
-    pixel_light : Emission, optional
-        Whose direct light is computed at each hit, beside that irradiance.
+    direct : 'points' or 'pixels'
+        Whether direct light of the scene's local emitters is computed at each hit, beside that
+        irradiance.
 
     Returns
     -------
     (h, w, 3) float32
         Linear radiance.
     """
-    integrator = integrator_for(asset, irradiance, pixel_light)
+    integrator = integrator_for(asset, irradiance, direct)
     return np.array(
         mitsuba().render(mi_scene, sensor=sensor, integrator=integrator, spp=spp, seed=seed)
     )[..., :3]

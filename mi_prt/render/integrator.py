@@ -4,18 +4,13 @@ from functools import cache
 
 import numpy as np
 
-from ..asset.meshless_asset import MeshlessAsset
-from ..asset.opening import load
+from ..asset.asset import load
 from ..errors import InputError, SettingsError
-from ..lighting.emission import emission_of
-from ..lighting.local_emitters import local_scene_light
-from ..lighting.places import Places
-from ..lighting.scene_light import scene_light
-from ..scene.materials import reflectance_at
 from ..scene.scene import Scene, SceneSource
 from ..scene.traversal import digest_of
 from ..system.runtime import VARIANTS, mitsuba
-from .direct_light import direct_irradiance
+from .direct_light import LocalEmitters
+from .shade import reflected_radiance
 
 DIRECT = ("points", "pixels")
 
@@ -52,8 +47,7 @@ def _plugin_class(variant):
     class PRTIntegrator(mi.SamplingIntegrator):
         """Precomputed radiance transfer (`prt`).
 
-        Shows a scene under its emitters with the transport of an asset: its distant emitters, or
-        its local ones if the asset is one of local lights. The irradiance at the asset's points is
+        Shows a scene under its emitters with the transports of an asset. The irradiance at the asset's points is
         interpolated at each hit and multiplied by the albedo there, so textures keep their own
         resolution; emitters and the background are shown as Mitsuba's own integrators show them.
 
@@ -63,7 +57,7 @@ def _plugin_class(variant):
             The asset; relative paths are resolved as Mitsuba resolves them (next to the XML file).
         hide_emitters : bool, default false
         direct : string, default "points"
-            With an asset of local lights, where direct light is computed: at its "points", or with
+            Where direct light of local emitters is computed: at the asset's "points", or with
             shadow rays at the "pixels".
 
         Raises
@@ -78,18 +72,13 @@ def _plugin_class(variant):
             If `direct` is another.
         """
 
-        def __init__(self, properties, asset=None, irradiance=None, pixel_light=None):
+        def __init__(self, properties, asset=None, irradiance=None, direct=None):
             super().__init__(properties)
             self.asset = asset or _load(str(properties["filename"]))
-            self._direct = str(properties.get("direct", "points"))
-            if self._direct not in DIRECT:
-                raise SettingsError(
-                    f"direct '{self._direct}' is not known: use {' or '.join(DIRECT)}"
-                )
+            self._direct = check_direct(direct or str(properties.get("direct", "points")))
             self._follows_emitters = irradiance is None
             self._irradiance = None if irradiance is None else mi.Float(irradiance.ravel())
-            self._places = None if pixel_light is None else Places(pixel_light)
-            self._scene = self._light = None
+            self._scene = self._light = self._emitters = None
 
         def render(self, scene, sensor=0, *arguments, **named):
             self._prepare(scene)
@@ -100,27 +89,18 @@ def _plugin_class(variant):
             opened = Scene(scene, SceneSource("object", content=scene))
             if self._scene is not scene or self._wrapped.hash != opened.hash:
                 self._scene = None  # until the new one is known to fit
-                self._interpolator = self.asset.interpolator(opened)
+                self._locator = self.asset.points.locator(opened)
                 self._wrapped, self._scene, self._light = opened, scene, None
-            if not self._follows_emitters:
+            light = digest_of(opened.mi_scene.emitters())
+            if self._light == light:
                 return
-            local = isinstance(self.asset, MeshlessAsset)
-            light = digest_of(
-                self._wrapped.local_emitters if local else self._wrapped.distant_emitters
-            )
-            if self._light != light:
-                self._irradiance = mi.Float(self._under(self._wrapped, local).ravel())
-                self._light = light
-
-        def _under(self, scene, local):
-            """Irradiance at the asset's points under a scene's own emitters."""
-            if not local:
-                return self.asset.irradiance(scene_light(scene))
-            light = local_scene_light(scene)
-            if self._direct == "points":
-                return self.asset.irradiance(light)
-            self._places = Places(emission_of(light))
-            return self.asset.irradiance(light, "indirect")
+            if self._direct == "pixels":
+                self._emitters = LocalEmitters(opened)
+            if self._follows_emitters:
+                self._irradiance = mi.Float(
+                    under_emitters(self.asset, opened, self._direct).ravel()
+                )
+            self._light = light
 
         def sample(self, scene, sampler, ray, medium=None, active=True):
             if self._scene is not scene:
@@ -129,12 +109,11 @@ def _plugin_class(variant):
             hit = active & si.is_valid()
 
             # --- light that the surface reflects
-            irradiance, found = self._interpolator.irradiance(self._irradiance, pi, si, ray, hit)
-            if self._places is not None:
-                irradiance += direct_irradiance(self._wrapped, self._places, si, ray, hit)
+            irradiance, found = self._locator.interpolated(self._irradiance, pi, si, ray, hit)
+            if self._emitters is not None:
+                irradiance += self._emitters.irradiance(si, ray, sampler, hit)
                 found = hit
-            albedo = reflectance_at(si, self._wrapped.surfaces, found)
-            radiance = dr.select(found, albedo * irradiance / dr.pi, 0)
+            radiance = reflected_radiance(irradiance, si, self._wrapped.surfaces, found)
 
             # --- light that is seen directly
             if self.hide_emitters:
@@ -174,7 +153,43 @@ def _plugin_class(variant):
     return PRTIntegrator
 
 
-def integrator_for(asset, irradiance=None, pixel_light=None):
+def under_emitters(asset, scene, direct="points"):
+    """Irradiance at an asset's points under the emitters of a scene, as they are now.
+
+    Parameters
+    ----------
+    asset : Asset
+    scene : Scene
+        Of the asset's geometry, whose lamps may have been dimmed, and its sky replaced.
+    direct : str
+        'pixels' leaves direct light of local emitters out.
+
+    Returns
+    -------
+    (n, 3) float32
+        W/m².
+
+    Raises
+    ------
+    LightError
+        If the asset holds no transport for any of the emitters, or a lamp whose light is baked was
+        changed otherwise than by dimming it.
+    """
+    light = asset.as_baked(scene)
+    if direct == "points" or light.local.is_empty:
+        return asset.irradiance(light)
+    irradiance = asset.irradiance(light.local, "indirect")
+    return irradiance if light.distant.is_empty else irradiance + asset.irradiance(light.distant)
+
+
+def check_direct(direct):
+    """Where direct light is computed, checked: 'points' or 'pixels'."""
+    if direct not in DIRECT:
+        raise SettingsError(f"direct '{direct}' is not known: use {' or '.join(DIRECT)}")
+    return direct
+
+
+def integrator_for(asset, irradiance=None, direct="points"):
     """The integrator for an asset in memory.
 
     Parameters
@@ -182,8 +197,9 @@ def integrator_for(asset, irradiance=None, pixel_light=None):
     asset : Asset
     irradiance : (n, 3), optional
         W/m² at the asset's points; by default that under the emitters of the scene it renders.
-    pixel_light : Emission, optional
-        Whose direct light is computed at each hit, beside that irradiance.
+    direct : 'points' or 'pixels'
+        Whether direct light of the local emitters of the scene it renders is computed at each hit,
+        beside that irradiance.
 
     Returns
     -------
@@ -201,7 +217,7 @@ def integrator_for(asset, irradiance=None, pixel_light=None):
             raise SettingsError(
                 f"irradiance must be of shape ({len(asset.points)}, 3), got {irradiance.shape}"
             )
-    return _plugin_class(mi.variant())(mi.Properties("prt"), asset, irradiance, pixel_light)
+    return _plugin_class(mi.variant())(mi.Properties("prt"), asset, irradiance, direct)
 
 
 def _load(filename):

@@ -210,7 +210,7 @@ def _parts(scene, points):
     surfaces.
     """
     backs = _backs(points)
-    fronts = points.patches.triangles()
+    fronts = points.layout.triangles()
     surface = points.surface[fronts[:, 0]]
     textured = np.array([_is_baked(s) for s in scene.surfaces])
     plain = fronts[~textured[surface]]
@@ -241,7 +241,7 @@ def _backs(points):
     does not reflect.
     """
     return np.array(
-        [points.patches.back[s["first_patch"]] if s["patches"] else 0 for s in points.surfaces]
+        [points.layout.back[s["first_patch"]] if s["patches"] else 0 for s in points.surfaces]
     )
 
 
@@ -253,7 +253,7 @@ def _textured_triangles(points, index, fronts):
         vertices, triangles = np.unique(fronts, return_inverse=True)
         return vertices, points.uv[vertices], triangles.reshape(-1, 3)
     # Points on the seam of an analytic shape have two uv: each node of its patch is a vertex.
-    patches, patch = points.patches, points.surfaces[index]["first_patch"]
+    patches, patch = points.layout, points.surfaces[index]["first_patch"]
     levels = patches.levels[patch]
     nodes = lattice_nodes(*levels)
     vertices = patches.nodes[patches.offsets[patch] :][: len(nodes)]

@@ -66,10 +66,6 @@ class Registry(Mapping):
         self._import()
         return name in self._kinds
 
-    def get(self, name, default=None):
-        """The kind of a name, or a default."""
-        return self[name] if name in self else default
-
     def __iter__(self):
         self._import()
         return iter(self._kinds)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from ..system.runtime import mitsuba
-from .direct import LANES, RAY_OFFSET
+from .bits import LANES, RAY_OFFSET
 
 # share of a sample's area whose square root is the least height of a light over it, see
 # `point_irradiance`

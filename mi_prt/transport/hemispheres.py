@@ -15,7 +15,7 @@ from ..directions.hemisphere import frame_of, frames
 from ..scene.materials import facing, reflectance_at
 from ..system.parallel import map_chunks
 from ..system.runtime import mitsuba
-from .direct import LANES, RAY_OFFSET
+from .bits import LANES, RAY_OFFSET
 
 # in the place of a sample: what is seen reflects nothing, or no sample is near it
 NOTHING = 0xFFFFFFFF
@@ -31,7 +31,8 @@ class Hemispheres:
     distance : (m, N) float32
         Metres; infinite where a ray escapes.
     sample : (m, N) uint32
-        The sample nearest to what is seen, or `NOTHING`.
+        The point nearest to what is seen, by its place in the order of the clusters, or
+        `NOTHING`.
     albedo : (m, N, channels) float32
         Of what is seen.
     """
@@ -47,7 +48,9 @@ class HemisphereTracer:
     Parameters
     ----------
     scene : Scene
-    samples : Samples
+    points : Points
+    clusters : Clusters
+        In whose order points are traced and counted.
     hemisphere : Hemisphere
     channels : 1 or 3
         Of the albedo that is kept; one channel is the mean of three.
@@ -55,13 +58,16 @@ class HemisphereTracer:
         Most rays of one wavefront. Results do not depend on it.
     """
 
-    def __init__(self, scene, samples, hemisphere, channels, lanes=LANES):
+    def __init__(self, scene, points, clusters, hemisphere, channels, lanes=LANES):
         mi = mitsuba()
-        self._scene, self._samples, self._hemisphere = scene, samples, hemisphere
+        self._scene, self._hemisphere = scene, hemisphere
         self._channels = channels
-        self._locator = samples.locator()
+        self._locator = points.locator(scene)
+        self._rank = mi.UInt32(clusters.rank.astype(np.uint32))
         self._vectors = mi.Float(np.pad(hemisphere.vectors, ((0, 0), (0, 1))).ravel())
-        self._origins = mi.Float(samples.points.ray_origins(RAY_OFFSET * scene.scale).ravel())
+        self._origins = mi.Float(
+            points.at(clusters.order).ray_origins(RAY_OFFSET * scene.scale).ravel()
+        )
         self._step = max(1, lanes // len(hemisphere))
 
     def trace(self, cluster, rotations):
@@ -95,14 +101,14 @@ class HemisphereTracer:
         direction = mi.Vector3f(*(a.x * v.x + a.y * v.y + a.z * v.z for a in (x, y, z)))
         origin = dr.gather(mi.Point3f, self._origins, local + dr.opaque(mi.UInt32, first))
         ray = mi.Ray3f(origin, direction)
-        si = self._scene.occluders.ray_intersect(ray)
-        normals, si.wi, reflects = facing(si, ray, self._scene.surfaces)
+        pi = self._scene.occluders.ray_intersect_preliminary(ray)
+        si = pi.compute_surface_interaction(ray)
+        _, si.wi, reflects = facing(si, ray, self._scene.surfaces)
         reflects &= si.is_valid()
-        sample, near = self._locator.nearest(
-            si.p, normals.shading, reflects, (origin, mi.Vector3f(x.z, y.z, z.z))
-        )
+        upward = mi.Vector3f(x.z, y.z, z.z)
+        point, found = self._locator.nearest(pi, si, ray, reflects, (origin, upward))
         reflectance = reflectance_at(si, self._scene.surfaces, reflects)
-        sample = dr.select(reflects & dr.isfinite(near), sample, NOTHING)
+        sample = dr.select(found, dr.gather(mi.UInt32, self._rank, point, found), NOTHING)
         channels = list(reflectance) if self._channels == 3 else [dr.mean(reflectance)]
         dr.eval(si.t, sample, channels)
         albedo = np.stack([np.array(c) for c in channels], axis=-1)

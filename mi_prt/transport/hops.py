@@ -13,19 +13,16 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse
 
-from ..points.locate import PatchLocator
 from ..scene.materials import facing, reflectance_at
 from ..system.parallel import BLOCK_ROWS, map_chunks
 from ..system.runtime import mitsuba
-from .direct import LANES, RAY_OFFSET
+from .bits import LANES, RAY_OFFSET
 
 # in the place of a point: what is seen reflects nothing, or nothing that is known
 NOTHING = 0xFFFFFFFF
 HOP = np.dtype([("point", "<u4"), ("albedo", "<f4", 3)])
 # of rays that a thread reads at a time; what it makes of them takes three times that
 _READ_BYTES = 1 << 22
-# weight of the points around a hit that are not buried, below which it counts as buried
-_LEAST_KEPT = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,8 +127,7 @@ class HopSampler:
     ----------
     scene : Scene
     points : Points
-    buried : (n,) bool
-        Points that reflect nothing; the others around a hit take their share.
+        Buried ones reflect nothing; the others around a hit take their share.
     transport : DirectTransport
     directions : DirectionLattice
     rays : int
@@ -141,11 +137,10 @@ class HopSampler:
         Most rays of one wavefront. Results do not depend on it.
     """
 
-    def __init__(self, scene, points, buried, transport, directions, rays, seed=0, lanes=LANES):
+    def __init__(self, scene, points, transport, directions, rays, seed=0, lanes=LANES):
         mi = mitsuba()
         self._scene, self._points, self._transport, self._seed = scene, points, transport, seed
-        self._locator = PatchLocator(scene, points)
-        self._kept = mi.Float(np.where(buried, 0.0, 1.0).astype(np.float32))
+        self._locator = points.locator(scene)
         self._origins = mi.Float(points.ray_origins(RAY_OFFSET * scene.scale).ravel())
         # Cell by cell: a sweep over all directions for each of a cell's rays would meet the strata
         # in the same places again and again.
@@ -229,19 +224,13 @@ class HopSampler:
         pi = self._scene.occluders.ray_intersect_preliminary(ray, active=active)
         si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
         _, si.wi, reflects = facing(si, ray, self._scene.surfaces)
-        points, weights, found = self._locator.locate(pi, si, active & si.is_valid() & reflects)
-        kept = [w * dr.gather(mi.Float, self._kept, p, found) for p, w in zip(points, weights)]
-        total = kept[0] + kept[1] + kept[2]
-        found &= total > _LEAST_KEPT
-        # One of the three by their weights: interpolation in the mean, with a third of the entries.
         # The number is hashed from point and ray, so that it depends on nothing else.
         number = (
             lane - local * self._rays + dr.opaque(mi.UInt32, self._seed * self._rays % (1 << 32))
         )
-        picked = mi.sample_tea_float32(owner, number) * total
-        point = dr.select(
-            picked < kept[0], points[0], dr.select(picked < kept[0] + kept[1], points[1], points[2])
-        )
+        random = mi.sample_tea_float32(owner, number)
+        active &= si.is_valid() & reflects
+        point, found = self._locator.picked(pi, si, ray, active, random)
         albedo = reflectance_at(si, self._scene.surfaces, found)
         point = dr.select(found & (dr.max(albedo) > 0), point, NOTHING)
         hops = np.empty(lanes, HOP)

@@ -40,21 +40,20 @@ class LocalDirect:
 
     Parameters
     ----------
-    samples : Samples
+    points : Points
+    clusters : Clusters
     depth : DepthBuffers
     """
 
-    def __init__(self, samples, depth):
+    def __init__(self, points, clusters, depth):
         import drjit as dr
 
         mi = mitsuba()
-        points = samples.points
+        self._order = clusters.order
+        self._radius = float(np.median(points.layout.spacing(points)))
+        points = points.at(clusters.order)
         self._count = len(points)
-        self._tree, self._normals, self._radius = (
-            cKDTree(points.positions),
-            points.normals,
-            samples.radius,
-        )
+        self._tree, self._normals = cKDTree(points.positions), points.normals
         self._hemisphere, self._directions = depth.hemisphere, depth.means.shape[1]
         # of four components: gathered in one load
         self._groups = -(-depth.coefficients.shape[1] // 4)
@@ -62,9 +61,9 @@ class LocalDirect:
         self._means = mi.Float(depth.means.ravel())
         self._vectors = mi.Float(np.pad(depth.vectors, ((0, 0), (0, 0), (0, extra))).ravel())
         self._coefficients = mi.Float(np.pad(depth.coefficients, ((0, 0), (0, extra))).ravel())
-        self._labels = mi.UInt32(samples.labels.astype(np.uint32))
+        self._labels = mi.UInt32(clusters.labels.astype(np.uint32))
         rotations = np.concatenate(
-            [cluster_frames(points.normals[cluster]) for cluster in samples.clusters]
+            [cluster_frames(points.normals[cluster]) for cluster in clusters.slices]
         )
         axes = (
             np.pad(axis, ((0, 0), (0, 1)))
@@ -90,7 +89,7 @@ class LocalDirect:
         import drjit as dr
 
         if not len(emission):
-            return (np.zeros((self._count, 3), np.float32) for _ in range(2))
+            return [np.zeros((self._count, 3), np.float32) for _ in range(2)]
         mi = mitsuba()
         places = Places(emission, self._sides(emission))
         point = dr.arange(mi.UInt32, self._count)
@@ -137,7 +136,12 @@ class LocalDirect:
         _, *sums = dr.while_loop(state, lambda number, *_: number < places.count, add)
         dr.eval(sums)
         largest = np.finfo(np.float32).max
-        return (np.minimum(np.array(x).T, largest) for x in sums)
+        results = []
+        for values in sums:
+            in_order = np.empty((self._count, 3), np.float32)
+            in_order[self._order] = np.minimum(np.array(values).T, largest)
+            results.append(in_order)
+        return results
 
     def _sides(self, emission):
         """For each place (k, 8): the normal of the surface that it stands over, on its side; how

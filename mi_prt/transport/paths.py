@@ -13,7 +13,7 @@ import scipy.sparse
 from ..scene.materials import facing, reflectance_at
 from ..system.parallel import BLOCK_ROWS, map_chunks
 from ..system.runtime import mitsuba
-from .direct import LANES, RAY_OFFSET
+from .bits import LANES, RAY_OFFSET
 from .hops import NOTHING
 
 ROULETTE_FROM = 3  # reflections after which a path may end by chance

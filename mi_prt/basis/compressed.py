@@ -1,0 +1,63 @@
+"""Transport in a basis: the pair of a basis and the coefficients of all points."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from ..system.parallel import BLOCK_ROWS, map_chunks, one_blas_thread
+
+
+@dataclass(frozen=True, eq=False)
+class Compressed:
+    """Transport of n points in a basis.
+
+    Parameters
+    ----------
+    basis : Basis
+    coefficients : (n, d) float32, or what else `Basis.encode` gives
+        (n, 3, d) where reflections colour the light and the basis does not join channels.
+    """
+
+    basis: object
+    coefficients: object
+
+    def __len__(self):
+        return self.coefficients.shape[0]
+
+    @cached_property
+    def _channels_apart(self):
+        """Whether each channel has coefficients of its own."""
+        return len(self.coefficients.shape) == 3
+
+    def respond(self, light, mean_response):
+        """Irradiance (n, 3) float32 in W/m² under projected light, c·ℓ + m (Eigentransport eq. 10,
+        mean kept exactly); compression leaves some of it below zero.
+
+        Parameters
+        ----------
+        light : (d, 3) float32
+        mean_response : (3,) float32
+        """
+        with one_blas_thread():
+            if self._channels_apart:
+                products = np.matmul(self.coefficients.swapaxes(0, 1), light.T[..., None])
+                irradiance = products[..., 0].T
+            else:
+                irradiance = self.coefficients @ light
+        irradiance += mean_response
+        return irradiance
+
+    def in_cells(self, cells):
+        """Transport (n, 1) or (n, 3) float32, the mean over some cells (n, k) of each point."""
+
+        def transport(first):
+            block = slice(first, first + BLOCK_ROWS)
+            return self.basis.at(self.coefficients[block], cells[block]).mean(axis=1)
+
+        seen = np.concatenate(list(map_chunks(transport, range(0, len(self), BLOCK_ROWS))))
+        return seen if seen.ndim == 2 else seen[:, None]
+
+    def rows(self, index):
+        """Transport (b, s) float32 as the basis reconstructs it, or (b, 3, s)."""
+        return self.basis.reconstruct(self.coefficients[index])

@@ -1,0 +1,323 @@
+"""The commands, one function each."""
+
+import sys
+import time
+import warnings
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ..errors import PrtError
+from . import options as take
+from .options import (
+    Component,
+    Define,
+    Direct,
+    Environment,
+    Json,
+    Lights,
+    Nearest,
+    OtherScene,
+    Rotate,
+    Seed,
+    Sensor,
+    Size,
+    Threads,
+    with_settings,
+)
+from .show import note, print_json, print_nested, progress_bar, table
+
+app = typer.Typer(
+    name="mi-prt",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+    context_settings={"help_option_names": ["-h", "--help"]},
+    help=(
+        "Precomputed radiance transfer for Mitsuba 3: precompute how light moves through a scene,"
+        " then relight it in milliseconds.\n\nExample: mi-prt precompute scenes/teapot.xml -o"
+        " teapot.prt && mi-prt relight teapot.prt -o teapot.png --rotate y:45"
+    ),
+)
+
+
+@app.command(epilog="Example: mi-prt doctor --json")
+def doctor(as_json: Json = False):
+    """Check this machine: LLVM, Mitsuba, Embree, raster platform; with the remedy for each
+    fault.
+    """
+    from ..system import doctor as examination
+
+    checks = examination.examine()
+    if as_json:
+        print_json(examination.as_dict(checks))
+    else:
+        colours = {"ok": "green", "warning": "yellow", "fault": "red"}
+        rows = [(f"[{colours[c.status]}]{c.status}[/]", c.name, c.value, c.remedy) for c in checks]
+        table([(*row[:3], row[3] or "") for row in rows])
+    if any(check.status == "fault" for check in checks):
+        raise typer.Exit(1)
+
+
+@app.command(epilog="Example: mi-prt info scenes/still_life.xml --directions cubemap:16 --json")
+@with_settings
+def info(
+    path: Annotated[Path, typer.Argument(help="A scene (XML) or an asset.")],
+    settings: dict,
+    define: Define = None,
+    as_json: Json = False,
+):
+    """Say what a scene requires and what precomputing it will cost, or what an asset holds."""
+    from ..asset.asset import load
+    from ..asset.container import is_asset
+    from ..asset.describe import describe_asset
+    from ..precompute.forecast import describe
+
+    if is_asset(path):
+        found = describe_asset(load(path))
+    else:
+        found = describe(path, take.parameters_of(define), **settings)
+    _show(found, as_json)
+
+
+@app.command(
+    epilog=(
+        "Examples: mi-prt precompute scenes/teapot.xml -o teapot.prt --coefficients 96 -D"
+        " spp=16\n\nmi-prt precompute scenes/day_room.xml -o room.prt   (its sky and its lamps)\n\n"
+        "mi-prt precompute scenes/teapot.xml -o teapot.prt --coefficients auto --variance 0.98"
+        " --max-memory 2G --resume\n\nmi-prt precompute scenes/room.xml -o room.prt --transports"
+        " own,local --points samples --count 45000"
+    )
+)
+@with_settings
+def precompute(
+    scene: Annotated[Path, typer.Argument(help="A Mitsuba XML file.")],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="FILE", help="The asset to write.")
+    ],
+    settings: dict,
+    resume: Annotated[
+        bool,
+        typer.Option("--resume", help="Continue an interrupted run of this file, if there is one."),
+    ] = False,
+    max_memory: Annotated[
+        str | None,
+        typer.Option(
+            "--max-memory", metavar="BYTES", help="Such as 3G; default: half of what is free."
+        ),
+    ] = None,
+    threads: Threads = None,
+    define: Define = None,
+    as_json: Json = False,
+):
+    """Precompute a scene's transport into one file.
+
+    What the scene's emitters call for is built: transport of distant light for a sky, exact columns
+    for its own lamps; transport for lamps that move is built when it is asked for. What is computed
+    on the way is kept in FILE.partial until FILE is whole: a run that is interrupted or killed can
+    be continued with --resume, and gives the same file.
+    """
+    from ..precompute.precompute import measure
+    from ..system.files import check_writable
+
+    check_writable(output)
+    take.set_threads(threads)
+    started = time.perf_counter()
+    with progress_bar(kept=f"{output}.partial") as progress:
+        asset, cost = measure(
+            scene,
+            take.parameters_of(define),
+            progress,
+            output,
+            resume,
+            max_memory,
+            **settings,
+        )
+    cost["seconds"]["total"] = round(time.perf_counter() - started, 4)
+    for entry in asset.scene["left_out"]:
+        shapes = f" ({', '.join(entry['shapes'][:5])})" if entry["shapes"] else ""
+        note(f"not modelled: {entry['what']}{shapes}")
+    held = {kind: _short(transport.summary()) for kind, transport in asset.transports.items()}
+    result = {
+        "points": len(asset.points),
+        "kind_of_points": asset.settings["points"],
+        "transports": held,
+        "bytes": output.stat().st_size,
+        **cost,
+    }
+    _show(result if as_json else {"wrote": str(output)} | result, as_json)
+
+
+@app.command(
+    epilog=(
+        "Examples: mi-prt relight teapot.prt -o teapot.png --envmap sky.exr --rotate y:90 --size"
+        " 640x480\n\nmi-prt relight room.prt -o dusk.png --light 'scene:sky_1*0.05' --light"
+        " scene:floor_lamp\n\nmi-prt relight room.prt -o lamp.png --light point:0,1.5,0:8,7,6"
+        " --component indirect\n\nmi-prt relight room.prt -o walk.mp4 --light point:0,1.5,0:8,7,6"
+        " --light-path '-1,1.5,0 1,1.5,0 1,1.5,1' --renderer raster"
+    )
+)
+def relight(
+    asset_path: Annotated[Path, typer.Argument(metavar="FILE", help="An asset.")],
+    output: Annotated[
+        Path,
+        typer.Option(
+            "-o",
+            "--output",
+            metavar="OUT",
+            help=".exr, .png, .ply or .npz; of a film .mp4, .gif or frame-%03d.png",
+        ),
+    ],
+    envmap: Environment = None,
+    light: Lights = None,
+    nearest: Nearest = 1,
+    rotate: Rotate = None,
+    sensor: Sensor = 0,
+    size: Size = None,
+    renderer: Annotated[
+        str, typer.Option("--renderer", metavar="mitsuba|raster", help="How pictures are drawn.")
+    ] = "mitsuba",
+    spp: Annotated[int, typer.Option("--spp", help="Samples per pixel of mitsuba's image.")] = 64,
+    component: Component = "total",
+    direct: Direct = "points",
+    light_path: Annotated[
+        str | None,
+        typer.Option(
+            "--light-path",
+            metavar="'x,y,z x,y,z …'",
+            help="Move the first --light along these places; OUT is a film.",
+        ),
+    ] = None,
+    frames: Annotated[int, typer.Option("--frames", metavar="N", help="Of the film.")] = 48,
+    fps: Annotated[int, typer.Option("--fps", help="Frames of the film in a second.")] = 25,
+    scene: OtherScene = None,
+    threads: Threads = None,
+    as_json: Json = False,
+):
+    """Relight an asset: an image, a mesh with vertex radiance, plain arrays, or a film of a light
+    that moves.
+    """
+    from ..asset.asset import load
+    from ..output.film import light_path as path_of
+    from ..output.moving import animate
+    from ..output.relight import relight_to_file
+
+    take.set_threads(threads)
+    chosen, turned = take.light_of(envmap, light), take.rotation_of(rotate)
+    asset = load(asset_path)
+    shown = {
+        "scene": scene,
+        "sensor": sensor,
+        "size": take.size_of(size),
+        "renderer": renderer,
+        "spp": spp,
+        "component": component,
+        "direct": direct,
+        "rotate": turned,
+    }
+    if light_path is not None:
+        path = path_of(light_path)
+        with progress_bar() as progress:
+            result = animate(asset, output, path, frames, fps, chosen, progress=progress, **shown)
+    else:
+        result = relight_to_file(asset, output, chosen, nearest=nearest, **shown)
+    _show(result if as_json else {"wrote": str(output)} | result, as_json)
+
+
+@app.command(
+    epilog=(
+        "Examples: mi-prt compare teapot.prt -o teapot-report --spp 512 --json\n\nmi-prt compare"
+        " room.prt -o room-report --light point:0,1.5,0:8,7,6"
+    )
+)
+def compare(
+    asset_path: Annotated[Path, typer.Argument(metavar="FILE", help="An asset.")],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the report.")
+    ],
+    envmap: Environment = None,
+    light: Lights = None,
+    nearest: Nearest = 1,
+    rotate: Rotate = None,
+    sensor: Sensor = 0,
+    size: Size = None,
+    spp: Annotated[int, typer.Option("--spp", help="Samples per pixel of the reference.")] = 256,
+    reference: Annotated[
+        str,
+        typer.Option(
+            "--reference",
+            metavar="modelled|full",
+            help="Truth with the materials that are modelled, or as the scene is written.",
+        ),
+    ] = "modelled",
+    direct: Direct = "points",
+    scene: OtherScene = None,
+    seed: Seed = 0,
+    threads: Threads = None,
+    as_json: Json = False,
+):
+    """Compare an asset with Mitsuba's ground truth and write a report with pictures."""
+    from ..asset.asset import load
+    from ..evaluate.compare import compare as run
+
+    take.set_threads(threads)
+    asset = load(asset_path)
+    with progress_bar() as progress:
+        result = run(
+            asset,
+            output,
+            take.light_of(envmap, light),
+            rotate=take.rotation_of(rotate),
+            scene=scene,
+            sensor=sensor,
+            size=take.size_of(size),
+            spp=spp,
+            reference=reference,
+            seed=seed,
+            progress=progress,
+            nearest=nearest,
+            direct=direct,
+        )
+    _show(result if as_json else {"wrote": str(output / "index.html")} | result, as_json)
+
+
+def main(arguments=None):
+    """Run the program; exit codes: 0 done, 2 bad usage or input, 130 interrupted, 1 anything
+    else.
+    """
+    warnings.showwarning = lambda message, *_, **__: note(str(message))
+    try:
+        from ..system.runtime import quiet_mitsuba
+
+        if not _only_help(sys.argv[1:] if arguments is None else arguments):
+            quiet_mitsuba()
+        app(arguments, standalone_mode=True)
+    except PrtError as error:
+        print(f"mi-prt: {error}", file=sys.stderr)
+        sys.exit(error.exit_code)
+    except MemoryError:
+        print(
+            "mi-prt: out of memory: use fewer --directions or a longer --edge-length, or set"
+            " --max-memory",
+            file=sys.stderr,
+        )
+        sys.exit(1)
+
+
+def _only_help(arguments):
+    return not arguments or any(a in ("-h", "--help") for a in arguments)
+
+
+def _show(found, as_json):
+    print_json(found) if as_json else print_nested(found)
+
+
+def _short(summary):
+    """A transport's summary without its longest entries."""
+    return {
+        name: value
+        for name, value in summary.items()
+        if name != "storage" and not name.endswith("_per_component")
+    }

@@ -1,0 +1,170 @@
+"""Options of the command line; those of a precomputation are made from its settings."""
+
+import inspect
+from functools import wraps
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ..errors import SettingsError
+from ..lighting.parse import FORMS
+from ..precompute.options import Flag
+from ..precompute.settings import OPTIONS
+
+_PANELS = {
+    "general": "What is precomputed",
+    "vertices": "Points: vertices",
+    "samples": "Points: samples",
+    "distant": "Transport: distant light",
+    "own": "Transport: the scene's own lamps",
+    "local": "Transport: lamps that move",
+}
+
+Json = Annotated[
+    bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else.")
+]
+Threads = Annotated[
+    int | None, typer.Option("--threads", metavar="N", help="CPU threads; default: all cores.")
+]
+Define = Annotated[
+    list[str] | None,
+    typer.Option("-D", metavar="NAME=VALUE", help="Value for a <default> parameter of the XML."),
+]
+Environment = Annotated[
+    Path | None,
+    typer.Option(
+        "--envmap", metavar="EXR", help="Environment map; default: the scene's own light."
+    ),
+]
+Lights = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--light",
+        metavar="SPEC",
+        help=f"{FORMS}. One number is grey; W/sr, W/m², W/(m² sr), degrees. May be repeated: lights"
+        " add up, also to --envmap.",
+    ),
+]
+Component = Annotated[
+    str, typer.Option("--component", metavar="total|direct|indirect", help="Of light.")
+]
+Direct = Annotated[
+    str,
+    typer.Option(
+        "--direct",
+        metavar="points|pixels",
+        help="Direct light of lamps at the points, or by shadow rays at pixels.",
+    ),
+]
+Nearest = Annotated[
+    int,
+    typer.Option(
+        "--nearest",
+        metavar="K",
+        help="Directions that stand for a lamp where only distant transport is there.",
+    ),
+]
+Rotate = Annotated[
+    str | None,
+    typer.Option(
+        "--rotate", metavar="AXIS:DEGREES", help="Turn distant light about x, y, z or a,b,c."
+    ),
+]
+OtherScene = Annotated[
+    Path | None,
+    typer.Option("--scene", metavar="SCENE", help="The asset's scene, if it is elsewhere by now."),
+]
+Sensor = Annotated[int, typer.Option("--sensor", help="Index of the scene's sensor.")]
+Size = Annotated[
+    str | None, typer.Option("--size", metavar="WxH", help="Image size; default: the sensor's.")
+]
+Seed = Annotated[int, typer.Option("--seed", help="Same seed, same result.")]
+
+
+def with_settings(command):
+    """A command whose parameter `settings` is a dict of the settings that the user gave; each is an
+    option of its own.
+    """
+    signature = inspect.signature(command)
+    names = [option.name for option in OPTIONS]
+    parameters = [p for p in signature.parameters.values() if p.name != "settings"]
+    parameters += [_parameter(option) for option in OPTIONS]
+
+    @wraps(command)
+    def run(**arguments):
+        settings = {name: arguments.pop(name) for name in names}
+        given = {name: value for name, value in settings.items() if value is not None}
+        return command(settings=given, **arguments)
+
+    run.__signature__ = signature.replace(parameters=parameters)
+    run.__annotations__ = {p.name: p.annotation for p in parameters}
+    return run
+
+
+def _parameter(option):
+    """A keyword parameter for Typer; None where the user does not give it."""
+    flag = "--" + option.name.replace("_", "-")
+    default = "" if option.default in (None, False) else f" [{_shown(option.default)}]"
+    rest = {"help": option.help + default, "rich_help_panel": _PANELS[option.group]}
+    if isinstance(option, Flag):
+        kind = typer.Option(f"{flag}/--no-{flag[2:]}", show_default=False, **rest)
+        annotation = Annotated[bool | None, kind]
+    else:
+        annotation = Annotated[str | None, typer.Option(flag, metavar=option.metavar, **rest)]
+    return inspect.Parameter(
+        option.name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation
+    )
+
+
+def _shown(value):
+    if value is True:
+        return "on"
+    return f"{value:,}" if isinstance(value, int) else str(value)
+
+
+# --- what the user passes ------------------------------------------------------------------------
+
+
+def parameters_of(define):
+    """Values for `<default>` parameters from NAME=VALUE texts."""
+    parameters = {}
+    for entry in define or []:
+        name, equals, value = entry.partition("=")
+        if not (name and equals):
+            raise SettingsError(f"-D {entry} is not of the form NAME=VALUE")
+        parameters[name] = value
+    return parameters
+
+
+def light_of(envmap, specs):
+    """The sum of --envmap and all --light; None if there is neither."""
+    from ..lighting.parse import parse_light
+
+    lights = ([] if envmap is None else [envmap]) + [parse_light(spec) for spec in specs or []]
+    return lights or None
+
+
+def rotation_of(text):
+    """Axis and degrees, or None."""
+    from ..lighting.parse import parse_rotation
+
+    return None if text is None else parse_rotation(text)
+
+
+def size_of(text):
+    """Width and height, or None."""
+    if text is None:
+        return None
+    width, times, height = text.lower().partition("x")
+    if not (times and width.isdigit() and height.isdigit()):
+        raise SettingsError(f"--size {text} is not of the form WxH, for example 640x480")
+    return int(width), int(height)
+
+
+def set_threads(threads):
+    """Use so many CPU threads; None leaves it."""
+    if threads is not None:
+        from ..system.runtime import set_threads
+
+        set_threads(threads)

@@ -1,0 +1,171 @@
+"""Transport of the scene's own lamps: a column for each, by shadow rays and gathering."""
+
+import time
+
+import numpy as np
+
+from ..errors import SettingsError
+from ..system.memory import resident_bytes
+from ..transport.bits import LANES
+from ..transport.lamp_reflections import reflected_light
+from ..transport.lamps import direct_light
+from ..transport.own import OwnTransport
+from .job import BUILDERS, Builder
+from .reflections import surface_shares
+
+LANE_BYTES = 400  # of rays that are followed to surfaces and from there to lamps
+LEAST_LANES = 1 << 16
+COLUMN_BYTES = 100  # of a point and lamp, while columns are put together
+PROBE_POINTS = 512
+ALL = 1 << 20  # in the place of a number of reflections: any number
+# rays for reflections that take as long as direct light, about
+REFLECTED_RAYS = 64
+
+
+@BUILDERS.register
+class OwnBuilder(Builder):
+    """Builds an `OwnTransport`; see `Builder`."""
+
+    kind = "own"
+
+    def __init__(self, job):
+        super().__init__(job)
+        self._lights = [light for light in job.scene.own_lights if not light.is_distant]
+        self._emitters = [light.emitter for light in self._lights]
+        self._lanes = self._lanes_within(job.limit)
+
+    @classmethod
+    def wanted(cls, scene, given):
+        """See `Builder.wanted`."""
+        count = len(scene.local_emitters)
+        return f"the scene has {count} lamp{'s' if count > 1 else ''} of its own" if count else ""
+
+    def identity(self):
+        """See `Builder.identity`."""
+        return {"lamps": [light.digest() + str(light.strength) for light in self._lights]}
+
+    def _lanes_within(self, limit):
+        """Lanes of a wavefront that fit beside what must be held."""
+        _ = self.job.scene.occluders
+        needed = COLUMN_BYTES * len(self.job.points) * len(self._lights)
+        held = resident_bytes()
+        if limit - held < needed + LANE_BYTES * LEAST_LANES:
+            raise SettingsError(
+                f"memory {limit / 1e6:,.0f} MB is too little: the scene holds {held / 1e6:,.0f} MB"
+                f" and the run needs {needed / 1e6:,.0f} MB more; raise max_memory (--max-memory)"
+                " or use fewer points"
+            )
+        return int(min(LANES, (limit - held - needed) // LANE_BYTES))
+
+    # --- building -----------------------------------------------------------------------------
+
+    def build(self):
+        """See `Builder.build`."""
+        job, settings = self.job, self.job.settings
+        found = job.workspace.keep("lamps", lambda: self._direct(job.points))
+        direct, noise = found[:-1], found[-1, :, 0]
+        job.clock.lap("lamps")
+        reflected, gathered = np.zeros_like(direct), {"bounces": 0}
+        if settings.lamp_bounces != 0:
+            found = job.workspace.keep("lamp reflections", lambda: self._reflected(direct))
+            reflected, gathered = found[:-1], _gathered(found[-1])
+        job.clock.lap("lamp reflections")
+        report = {
+            "rays": len(job.points) * len(self._lights),
+            "channels": 3,
+            "direct_noise": float(noise.max(initial=0)),
+            **gathered,
+        }
+        lamps = tuple(_lamp(light) for light in self._lights)
+        exact = OwnTransport(
+            lamps, _columns(direct), _columns(reflected), settings.quantize, report
+        )
+        # the values that a file gives back
+        return OwnTransport.from_arrays(exact.header(), exact.arrays(), job.points)
+
+    def _direct(self, points):
+        """Direct irradiance (n, k, 3) of the lamps, and in one more row its noise."""
+        job, settings = self.job, self.job.settings
+        found = direct_light(
+            job.scene,
+            points,
+            self._emitters,
+            settings.lamp_tolerance,
+            seed=settings.seed,
+            lanes=self._lanes,
+            progress=lambda done, total: job.progress("lamps", done, total, ""),
+        )
+        noise = found.noise(surface_shares(points, points.buried))
+        return np.concatenate([found.irradiance, _row(noise)])
+
+    def _reflected(self, direct):
+        """Reflected irradiance (n, k, 3) of the lamps, and in one more row what is reported."""
+        job, settings = self.job, self.job.settings
+        bounces = settings.lamp_bounces
+        found = reflected_light(
+            job.scene,
+            job.points,
+            job.points.buried,
+            self._emitters,
+            direct,
+            job.points.locator(job.scene),
+            settings.lamp_rays,
+            None if bounces == "auto" else bounces,
+            seed=settings.seed,
+            lanes=self._lanes,
+            progress=lambda done, total: job.progress("lamp reflections", done, total, ""),
+        )
+        noise = found.noise(surface_shares(job.points, job.points.buried))
+        row = _row(noise)
+        row[0, :, 1] = max(ALL if count is None else count for count in found.bounces)
+        return np.concatenate([found.irradiance, row])
+
+    # --- forecast -----------------------------------------------------------------------------
+
+    def forecast(self):
+        """See `Builder.forecast`: some of the points are lit."""
+        job, settings = self.job, self.job.settings
+        n, k = len(job.points), len(self._lights)
+        index = np.random.default_rng(settings.seed).permutation(n)[:PROBE_POINTS]
+        few = job.points.at(np.sort(index))
+        self._direct(few)  # compiles the kernels
+        started = time.perf_counter()
+        self._direct(few)
+        seconds = (time.perf_counter() - started) * n / len(few)
+        width = 12 if settings.quantize == "16" else 24
+        return {
+            "seconds": round(seconds * (1 + settings.lamp_rays / REFLECTED_RAYS), 1),
+            "bytes": width * n * k,
+            "memory": LANES * LANE_BYTES // 4 + COLUMN_BYTES * n * k,
+            "requires": {},
+            "chosen": {},
+            "reasons": {"lamp_tolerance": "shadow rays go on until their noise is below it"},
+        }
+
+
+def _lamp(light):
+    """What is recorded of a lamp."""
+    return {
+        "name": light.name,
+        "kind": light.kind,
+        "digest": light.digest(),
+        "strength": None if light.strength is None else [float(x) for x in light.strength],
+    }
+
+
+def _row(values):
+    """Values (k,) as a row (1, k, 3) behind columns."""
+    return np.repeat(np.asarray(values, np.float32)[None, :, None], 3, axis=2)
+
+
+def _gathered(row):
+    bounces = int(row[0, 1])
+    return {
+        "bounces": "auto" if bounces == ALL else bounces,
+        "indirect_noise": float(row[:, 0].max(initial=0)),
+    }
+
+
+def _columns(irradiance):
+    """Irradiance (n, k, 3) as columns (3, n, k)."""
+    return np.ascontiguousarray(np.moveaxis(irradiance, 2, 0))

@@ -1,0 +1,165 @@
+"""What all transports offer, and all transports by their names.
+
+A transport answers one question: what do the points receive under this light, of this component?
+"""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import ClassVar
+
+from ..errors import SettingsError
+from ..system.registry import Registry
+
+TRANSPORTS = Registry("transport", "mi_prt.transport")
+COMPONENTS = ("total", "direct", "indirect")
+
+
+@dataclass(frozen=True)
+class Question:
+    """What is asked of a transport.
+
+    Parameters
+    ----------
+    light : Light
+        Resolved: of parts that the transport takes.
+    component : str
+        One of `COMPONENTS`.
+    nearest : int
+        Directions that stand for a local light in transport that knows directions only
+        (Eigentransport, section 4.2.1).
+
+    Raises
+    ------
+    SettingsError
+        If the component is another.
+    """
+
+    light: object
+    component: str = "total"
+    nearest: int = 1
+
+    def __post_init__(self):
+        if self.component not in COMPONENTS:
+            raise SettingsError(
+                f"component '{self.component}' is not known: use {', '.join(COMPONENTS)}"
+            )
+
+
+class Transport(ABC):
+    """Transport of light of some kinds to the points of an asset.
+
+    Attributes
+    ----------
+    kind : str
+        Its name.
+    takes_words : str
+        What light it takes, in words.
+    report : dict
+        What was measured while it was computed; plain data.
+    """
+
+    kind: ClassVar[str]
+    takes_words: ClassVar[str]
+    report: dict
+
+    # --- relighting ---------------------------------------------------------------------------
+
+    @classmethod
+    @abstractmethod
+    def is_for(cls, part):
+        """Whether transport of this kind is made for a part of light (LightPart)."""
+
+    def takes(self, part):
+        """Whether it answers for a part of light."""
+        return self.is_for(part)
+
+    def stands_in_for(self, part):
+        """Whether it can answer for a part where no other transport takes it, as well as it
+        can.
+        """
+        return False
+
+    def check(self, points, light):
+        """What there is to say of light that it takes before it answers: a warning or None."""
+        return None
+
+    @abstractmethod
+    def respond(self, points, question):
+        """Irradiance at the points.
+
+        Parameters
+        ----------
+        points : Points
+            Those of the asset.
+        question : Question
+
+        Returns
+        -------
+        (n, 3) float32
+            W/m², not negative.
+
+        Raises
+        ------
+        SettingsError
+            If it does not hold the component.
+        """
+
+    def prepare(self, light):
+        """Light in a form that turns, and is projected, in milliseconds; a Light."""
+        return light
+
+    @property
+    def channels(self):
+        """Colour channels of the transport: 3 where reflections colour the light, else 1."""
+        return self.report.get("channels", 1)
+
+    @property
+    def components(self):
+        """Components that it tells apart."""
+        return COMPONENTS
+
+    @property
+    @abstractmethod
+    def reflects(self):
+        """Whether it holds reflected light."""
+
+    # --- what it holds ------------------------------------------------------------------------
+
+    @abstractmethod
+    def summary(self):
+        """What it holds, as plain data for `info`; with `storage` in bytes."""
+
+    @abstractmethod
+    def ledger(self):
+        """What is known of its errors, a list of `Entry`."""
+
+    # --- in files -----------------------------------------------------------------------------
+
+    @abstractmethod
+    def header(self):
+        """Plain data that, with the arrays, makes it again."""
+
+    @classmethod
+    @abstractmethod
+    def header_spec(cls):
+        """What its header must be, see `system.schema`."""
+
+    @classmethod
+    @abstractmethod
+    def shapes(cls, header):
+        """What its arrays must be, {name: Array}; n is the number of points."""
+
+    @abstractmethod
+    def arrays(self):
+        """Its arrays by name."""
+
+    @classmethod
+    @abstractmethod
+    def from_arrays(cls, header, arrays, points):
+        """The transport from what `header` and `arrays` gave, of the right shapes.
+
+        Raises
+        ------
+        ValueError
+            If they do not fit together.
+        """
