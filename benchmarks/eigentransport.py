@@ -19,11 +19,12 @@ from pathlib import Path
 
 import matplotlib
 import numpy as np
+from mi_prt.basis.bases import fit_basis
+from mi_prt.precompute.info import storage_bytes
 from page import ROOT, saved, write_page
 
 import mi_prt
 from mi_prt import LightWarning
-from mi_prt.basis.bases import fit_basis
 from mi_prt.basis.rows import Rows
 from mi_prt.basis.target import Target
 from mi_prt.directions import Cubemap
@@ -33,7 +34,6 @@ from mi_prt.lighting.cells import cell_radiance
 from mi_prt.lighting.lattice import on_lattice
 from mi_prt.lighting.scene_light import lit_scene, scene_light
 from mi_prt.points.points import sample_points
-from mi_prt.precompute.info import storage_bytes
 from mi_prt.render.display import display, exposure
 from mi_prt.render.image import coverage, pick_sensor, render_image, resized
 from mi_prt.scene.scene import open_scene

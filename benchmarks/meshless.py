@@ -21,11 +21,11 @@ from pathlib import Path
 from unittest import mock
 
 import numpy as np
+from mi_prt.asset.meshless_file import compressed
 from page import plt, saved, write_page
 from scipy.spatial import cKDTree
 
 import mi_prt
-from mi_prt.asset.meshless_file import compressed
 from mi_prt.basis.clustered import leading_components
 from mi_prt.evaluate import ground_truth, metrics
 from mi_prt.evaluate.ground_truth import Reference

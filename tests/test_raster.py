@@ -13,11 +13,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from conftest import diffuse, disk, emitted, rectangle, scene, sky_of, sphere
+from mi_prt.points.interpolate import PatchInterpolator
 
 import mi_prt
 from mi_prt.errors import SceneError, SettingsError
 from mi_prt.lighting.scene_light import scene_light
-from mi_prt.points.interpolate import PatchInterpolator
 from mi_prt.points.points import sample_points
 from mi_prt.render.display import display, exposure
 from mi_prt.render.image import render_image, resized
