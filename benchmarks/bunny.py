@@ -23,7 +23,7 @@ from mi_prt.directions import parse_directions
 from mi_prt.evaluate import metrics
 from mi_prt.evaluate.ground_truth import point_irradiance
 from mi_prt.lighting.cells import cell_radiance
-from mi_prt.lighting.scene_light import lit_scene
+from mi_prt.lighting.to_mitsuba import lit_scene
 from mi_prt.points.points import sample_points
 from mi_prt.scene.scene import open_scene
 from mi_prt.system.runtime import mitsuba
@@ -72,7 +72,7 @@ def main():
     for path in sorted((arguments.assets / "hdr").glob("*.exr")):
         environment = mi_prt.EnvironmentMap(path)
         truth = point_irradiance(
-            lit_scene(scene.mi_scene, environment), points.at(chosen), arguments.samples
+            lit_scene(scene, environment), points.at(chosen), arguments.samples
         )
         radiance = cell_radiance(environment, directions)
         full = rows @ (radiance * directions.solid_angles[:, None]).astype(np.float32)

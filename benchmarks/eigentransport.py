@@ -31,8 +31,9 @@ from mi_prt.directions import Cubemap
 from mi_prt.evaluate import metrics
 from mi_prt.evaluate.ground_truth import image, point_irradiance
 from mi_prt.lighting.cells import cell_radiance
+from mi_prt.lighting.from_mitsuba import scene_light
 from mi_prt.lighting.lattice import on_lattice
-from mi_prt.lighting.scene_light import lit_scene, scene_light
+from mi_prt.lighting.to_mitsuba import lit_scene
 from mi_prt.points.points import sample_points
 from mi_prt.render.display import display, exposure
 from mi_prt.render.image import coverage, pick_sensor, render_image, resized
@@ -309,7 +310,7 @@ def shading(assets, pictures):
     path = ROOT / "scenes" / "teapot.xml"
     scene = open_scene(path)
     light = scene_light(scene)
-    truth = lit_scene(scene.modelled())
+    truth = lit_scene(scene, modelled=True)
     with resized(pick_sensor(truth, 0), (400, 300)) as camera:
         reference = image(truth, camera, 512)
         covered = coverage(truth, camera, 64) > 1 - 1e-4
@@ -402,7 +403,7 @@ def rotation(assets, pictures):
                 metrics.relative_rmse(irradiance(radiance), irradiance(expected)),
             ]
         truth = point_irradiance(
-            lit_scene(sampled.scene.mi_scene, turned), sampled.points.at(chosen), POINT_SAMPLES
+            lit_scene(sampled.scene, turned), sampled.points.at(chosen), POINT_SAMPLES
         )
         figures += [
             metrics.relative_rmse(irradiance(r), truth.mean) for r in (expected, results[4])
@@ -547,9 +548,7 @@ def local_lights(assets, pictures):
     chosen = np.sort(np.random.default_rng(0).permutation(len(pca.points))[:4000])
     for height in (20.0, 8.0, 4.0, 2.5, 1.6, 1.1, 0.6):
         light = mi_prt.PointLight((1.2, height, 0.8), 100.0)
-        truth = point_irradiance(
-            lit_scene(sampled.scene.mi_scene, light), pca.points.at(chosen), 1
-        ).mean
+        truth = point_irradiance(lit_scene(sampled.scene, light), pca.points.at(chosen), 1).mean
         results = pca.irradiance(light), pca.irradiance(light, nearest=4), none.irradiance(light)
         figures = [
             f(result[chosen], truth)

@@ -21,7 +21,8 @@ import mi_prt
 from mi_prt import LightWarning
 from mi_prt.directions import parse_directions
 from mi_prt.evaluate import ground_truth, metrics
-from mi_prt.lighting.scene_light import lit_scene, scene_light
+from mi_prt.lighting.from_mitsuba import scene_light
+from mi_prt.lighting.to_mitsuba import lit_scene
 from mi_prt.precompute.precompute import measure
 from mi_prt.render.display import display, exposure
 from mi_prt.render.image import pick_sensor, render_image, resized
@@ -67,11 +68,11 @@ def methods(assets, pictures):
         direct, _ = measure(path, coefficients=64, bounces=0)
         chosen = _some(direct)
         truth = ground_truth.indirect_irradiance(
-            lit_scene(scene.modelled(), light), direct.points.at(chosen), 16384, BOUNCES
+            lit_scene(scene, light, modelled=True), direct.points.at(chosen), 16384, BOUNCES
         )
         whole = (
             ground_truth.point_irradiance(
-                lit_scene(scene.modelled(), light), direct.points.at(chosen), 8192
+                lit_scene(scene, light, modelled=True), direct.points.at(chosen), 8192
             ).mean
             + truth.mean
         )
@@ -266,7 +267,7 @@ def speed(assets, pictures):
     worst = 0.0
     for path in sorted((assets / "hdr").glob("*.exr")):
         environment = mi_prt.EnvironmentMap(path)
-        lit = lit_scene(scene.mi_scene, environment)
+        lit = lit_scene(scene, environment)
         truth = ground_truth.irradiance(lit, asset.points.at(chosen), 16384, 4096, BOUNCES)
         result = asset.irradiance(environment)[chosen]
         error = _error(result, truth)
@@ -286,9 +287,7 @@ def _against_mitsuba(scene, asset, seconds):
     paths = 64
     errors, spent = [], 0.0
     for direction in directions.vectors[few]:
-        lit = lit_scene(
-            scene.mi_scene, mi_prt.DirectionalLight(direction=-direction, irradiance=(1, 1, 1))
-        )
+        lit = lit_scene(scene, mi_prt.DirectionalLight(direction=-direction, irradiance=(1, 1, 1)))
         # compiles
         ground_truth.indirect_irradiance(lit, asset.points.at(np.arange(64)), paths, BOUNCES)
         started = time.perf_counter()
@@ -314,7 +313,7 @@ def cornell(assets, pictures):
     path = ROOT / "scenes" / "cornell_sky.xml"
     asset, cost = measure(path, coefficients=256, rays_per_direction=4)
     scene = open_scene(path)
-    lit = lit_scene(scene.mi_scene, scene_light(scene))
+    lit = lit_scene(scene, scene_light(scene))
     with resized(pick_sensor(lit, 0), (480, 400)) as camera:
         truth = ground_truth.image(lit, camera, 2048, 0, -1).mean
         direct = ground_truth.image(lit, camera, 512, 0, 2).mean

@@ -31,7 +31,7 @@ from mi_prt.evaluate import ground_truth, metrics
 from mi_prt.evaluate.ground_truth import Reference
 from mi_prt.lighting.emission import emission_of
 from mi_prt.lighting.light import as_light
-from mi_prt.lighting.scene_light import lit_scene
+from mi_prt.lighting.to_mitsuba import lit_scene
 from mi_prt.points.particles import cross_surfaces, free_places, trace_particles
 from mi_prt.points.points import sample_points
 from mi_prt.points.samples import COVERED
@@ -427,7 +427,7 @@ def _lights(path, count):
 @cache
 def _shapes(path):
     """The scene as modelled, without any light."""
-    return lit_scene(_scene(path).modelled(), mi_prt.PointLight((0, 0, 0), 0.0), keep_local=False)
+    return lit_scene(_scene(path), mi_prt.PointLight((0, 0, 0), 0.0), modelled=True)
 
 
 _TRUTHS = {}
@@ -617,7 +617,7 @@ def _against_path(path, asset, name, lights):
     lines = []
     for place in lights[:3]:
         _, reflected = _truth(path, points, place)
-        lit = lit_scene(_scene(path).modelled(), mi_prt.PointLight(place, 1.0), keep_local=False)
+        lit = lit_scene(_scene(path), mi_prt.PointLight(place, 1.0), modelled=True)
         other = ground_truth.indirect_irradiance(lit, points, 2 * effort.paths, None, LIGHT_SEED)
         lines.append(
             f"{other.mean.sum() / max(reflected.mean.sum(), 1e-30) - 1:+.1%} with {other.noise:.0%}"
@@ -1200,12 +1200,11 @@ def _brute_force(path, asset):
             scene.occluders, asset.points, [lights[i % len(lights)]]
         )
     )
-    dark = scene.modelled()
     needed = {}
     for i, (place, light) in enumerate(zip(places, lights)):
         _, truth = _truth(path, points, place)
         error = _beyond_noise(asset.irradiance(light, "indirect")[chosen], truth)
-        lit = lit_scene(dark, light, keep_local=False)
+        lit = lit_scene(scene, light, modelled=True)
         for way, run, where in (
             ("Mitsuba's `path`", ground_truth.indirect_irradiance, (effort.paths, None)),
             ("the bidirectional estimate", _reflected_irradiance, (place, effort.paths)),

@@ -14,7 +14,7 @@ import numpy as np
 
 import mi_prt
 from mi_prt.directions import parse_directions
-from mi_prt.lighting.scene_light import scene_light
+from mi_prt.lighting.from_mitsuba import scene_light
 from mi_prt.points.points import sample_points
 from mi_prt.scene.scene import open_scene
 from mi_prt.system.runtime import count_kernels, thread_count

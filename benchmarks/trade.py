@@ -16,7 +16,8 @@ import numpy as np
 
 from mi_prt.evaluate import metrics
 from mi_prt.evaluate.ground_truth import irradiance
-from mi_prt.lighting.scene_light import lit_scene, scene_light
+from mi_prt.lighting.from_mitsuba import scene_light
+from mi_prt.lighting.to_mitsuba import lit_scene
 from mi_prt.precompute.precompute import measure
 from mi_prt.scene.scene import open_scene
 
@@ -51,9 +52,7 @@ def main():
             if truths is None:
                 chosen = np.sort(np.random.default_rng(0).permutation(len(asset.points))[:2000])
                 at = asset.points.at(chosen)
-                truths = [
-                    irradiance(lit_scene(scene.mi_scene, light), at, 8192, 2048) for light in lights
-                ]
+                truths = [irradiance(lit_scene(scene, light), at, 8192, 2048) for light in lights]
             projected = [asset.project_light(light) for light in lights]
             results = np.stack([asset.irradiance_from(*light)[chosen] for light in projected])
             expected = np.stack([truth.mean for truth in truths])

@@ -12,7 +12,8 @@ from mi_prt.output.relight_local import animate_local
 from PIL import Image
 
 import mi_prt
-from mi_prt.lighting.scene_light import lit_scene, scene_light
+from mi_prt.lighting.from_mitsuba import scene_light
+from mi_prt.lighting.to_mitsuba import lit_scene
 from mi_prt.output.film import light_path
 from mi_prt.render.display import display, exposure
 from mi_prt.render.image import render_image, resized
@@ -88,7 +89,7 @@ def turning_sky(asset, path, frames):
         radiance = asset.relight(prepared.rotated("y", degrees))
         relighting.append(time.perf_counter() - begun)
         factor = factor or exposure(radiance)
-        turned = lit_scene(scene.mi_scene, own.rotated("y", degrees))
+        turned = lit_scene(scene, own.rotated("y", degrees))
         with resized(turned.sensors()[0], FRAME_SIZE) as sensor:
             shown = display(render_image(asset, turned, sensor, spp=16), factor)
         pictures.append(Image.fromarray((shown * 255 + 0.5).astype("uint8")))

@@ -27,9 +27,13 @@ from .errors import (
     SettingsError,
 )
 from .evaluate.compare import compare
+from .lighting.area import AreaLight
+from .lighting.directional import DirectionalLight
 from .lighting.environment import EnvironmentMap, LightWarning
-from .lighting.light import DirectionalLight, Light
-from .lighting.local_lights import AreaLight, PointLight, SpotLight
+from .lighting.light import Light
+from .lighting.own_light import SceneLight
+from .lighting.point import PointLight
+from .lighting.spot import SpotLight
 from .output.relight import relight_to_file
 from .precompute.precompute import precompute
 from .render.integrator import register_integrator
@@ -50,6 +54,7 @@ __all__ = [
     "PrtError",
     "RuntimeSetupError",
     "SceneError",
+    "SceneLight",
     "SettingsError",
     "SpotLight",
     "compare",

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from conftest import bias, diffuse, rectangle, relative_l2, scene, sky_of, sphere
-from mi_prt.lighting.to_mitsuba import lit_scene
 
 import mi_prt
 from mi_prt.evaluate import ground_truth
+from mi_prt.lighting.to_mitsuba import lit_scene
 from mi_prt.render.image import render_image
 from mi_prt.scene.scene import open_scene
 from mi_prt.system.runtime import mitsuba

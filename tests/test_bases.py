@@ -8,16 +8,16 @@ import h5py
 import numpy as np
 import pytest
 from conftest import bias, cube, diffuse, disk, rectangle, relative_l2, scene, sky_of
-from mi_prt.basis.bases import BASES
-from mi_prt.precompute.info import describe, describe_asset
 
 import mi_prt
 from mi_prt import AssetError, SettingsError
+from mi_prt.basis.bases import BASES
 from mi_prt.directions import parse_directions
 from mi_prt.evaluate import ground_truth
 from mi_prt.lighting.cells import cell_radiance
 from mi_prt.lighting.lattice import on_lattice
-from mi_prt.lighting.scene_light import lit_scene
+from mi_prt.lighting.to_mitsuba import lit_scene
+from mi_prt.precompute.info import describe, describe_asset
 from mi_prt.scene.scene import open_scene
 from mi_prt.transport.bits import sample_direct
 
@@ -231,7 +231,7 @@ def test_every_lattice_agrees_with_mitsuba(lattice, kind):
     )
     seen = np.flatnonzero(~asset.buried)
     truth = ground_truth.point_irradiance(
-        lit_scene(open_scene(scene(**PARTS)).mi_scene, sky()), asset.points.at(seen), 8192
+        lit_scene(open_scene(scene(**PARTS)), sky()), asset.points.at(seen), 8192
     )
     result = asset.irradiance(sky())[seen]
     assert truth.noise < 0.015
@@ -257,7 +257,7 @@ def test_every_lattice_agrees_with_mitsuba_after_reflections(lattice, indirect):
         rays_per_direction=2,
     )
     seen = np.flatnonzero(~asset.buried)
-    lit = lit_scene(open_scene(scene(**COLOURED)).mi_scene, sky())
+    lit = lit_scene(open_scene(scene(**COLOURED)), sky())
     truth = ground_truth.irradiance(lit, asset.points.at(seen), 8192, 512, 1)
     result = asset.irradiance(sky())[seen]
     assert truth.noise < 0.015

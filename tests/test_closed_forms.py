@@ -27,7 +27,7 @@ from conftest import (
 import mi_prt
 from mi_prt.directions import Cubemap
 from mi_prt.lighting.cells import cell_radiance
-from mi_prt.lighting.scene_light import scene_light
+from mi_prt.lighting.from_mitsuba import scene_light
 from mi_prt.scene.scene import open_scene
 from mi_prt.system.runtime import mitsuba
 from mi_prt.transport.bits import sample_direct

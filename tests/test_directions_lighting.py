@@ -26,9 +26,10 @@ import mi_prt
 from mi_prt import DirectionalLight, EnvironmentMap, Light, LightError, LightWarning, SettingsError
 from mi_prt.directions import Cubemap, parse_directions
 from mi_prt.lighting.cells import cell_radiance
-from mi_prt.lighting.environment import rotation_matrix
+from mi_prt.lighting.from_mitsuba import scene_light
 from mi_prt.lighting.light import as_light
-from mi_prt.lighting.scene_light import lit_scene, scene_light
+from mi_prt.lighting.rotation import rotation_matrix
+from mi_prt.lighting.to_mitsuba import lit_scene
 from mi_prt.scene.scene import open_scene
 from mi_prt.system.runtime import mitsuba
 
@@ -320,7 +321,7 @@ def test_quadrature_equals_mitsubas_envmap(seed):
     )
     for light in (
         EnvironmentMap(pixels, rotation, scale=0.7),
-        scene_light(open_scene(scene(s=sphere(), e=emitter))).maps[0],
+        scene_light(open_scene(scene(s=sphere(), e=emitter))).parts[0],
     ):
         total = 0
         for vectors, solid_angles, radiance in light.quadrature(0.05, band=5000):
@@ -363,9 +364,9 @@ def test_rotating_light_of_all_kinds_together():
     direction.
     """
     sun = DirectionalLight([0, 0, -1.0], [1, 1, 1])  # from +z
-    both = Light((EnvironmentMap(uniform_sky()),), (sun,)).rotated("y", 90)  # +z to +x
-    np.testing.assert_allclose(both.directionals[0].direction, [-1, 0, 0], atol=1e-12)
-    np.testing.assert_allclose(both.maps[0].rotation @ [0, 0, 1], [1, 0, 0], atol=1e-12)
+    both = Light((EnvironmentMap(uniform_sky()), sun)).rotated("y", 90)  # +z to +x
+    np.testing.assert_allclose(both.parts[1].direction, [-1, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(both.parts[0].rotation @ [0, 0, 1], [1, 0, 0], atol=1e-12)
 
 
 def test_rotations_compose_and_keep_the_map():
@@ -394,13 +395,13 @@ def test_prepared_light_turns_like_the_map():
         lambda d: np.exp(2 * d @ np.array([[0.5, 1, 0], [0.5, 0, 1], [0.7, 0, 0.1]])), 64
     )
     sun = DirectionalLight([0, -1, 0.2], [1, 1, 1])
-    exact = Light((EnvironmentMap(pixels),), (sun,))
+    exact = Light((EnvironmentMap(pixels), sun))
     prepared = asset.prepare_light(exact)
     flat = asset.prepare_light(uniform_sky([1.0, 2.0, 3.0]))
     for axis, degrees in [("y", 0), ("y", 33), ((1, 2, 3), 120), ("z", -7)]:
         now, then = prepared.rotated(axis, degrees), exact.rotated(axis, degrees)
         np.testing.assert_allclose(energy_of(now), energy_of(then), rtol=1e-4)
-        without = [cell_radiance(Light(l.maps), LATTICE) for l in (now, then)]
+        without = [cell_radiance(l.parts[0], LATTICE) for l in (now, then)]
         assert relative_l2(*without) < 0.02
         np.testing.assert_allclose(
             cell_radiance(flat.rotated(axis, degrees), LATTICE) / [1, 2, 3], 1, rtol=1e-3
@@ -414,8 +415,10 @@ def test_lit_scene_gives_mitsuba_the_same_light():
     """
     rng = np.random.default_rng(6)
     light = Light(
-        (EnvironmentMap(rng.random((8, 16, 3)), random_rotation(rng)),),
-        (DirectionalLight([1, -2, 0.5], [3, 2, 1]),),
+        (
+            EnvironmentMap(rng.random((8, 16, 3)), random_rotation(rng)),
+            DirectionalLight([1, -2, 0.5], [3, 2, 1]),
+        )
     )
     lit = lit_scene(mi.load_dict(scene(s=sphere(), old={"type": "constant"})), light)
     again = scene_light(open_scene(lit))

@@ -41,7 +41,8 @@ from mi_prt.lighting.cells import cell_radiance
 from mi_prt.lighting.light import as_light
 from mi_prt.lighting.local import arrival, hull_warning
 from mi_prt.lighting.parse import parse_light, parse_rotation
-from mi_prt.lighting.scene_light import lit_scene, summed_maps
+from mi_prt.lighting.summed import summed_maps
+from mi_prt.lighting.to_mitsuba import lit_scene
 from mi_prt.points.hull import ConvexHull
 from mi_prt.points.points import sample_points
 from mi_prt.scene.scene import open_scene
@@ -80,6 +81,12 @@ def unoccluded(points, lights):
         cosine = np.maximum((toward / distance * points.normals).sum(axis=1, keepdims=True), 0)
         total += light.intensity * cosine / distance**2
     return total
+
+
+def seen(light, positions, directions, nearest=1):
+    """Cells and irradiance of a light of one place."""
+    (arriving,) = arrival(light.emission(), positions, directions, nearest)
+    return arriving
 
 
 def precompute(content, directions="cubemap:16", **settings):
@@ -121,7 +128,7 @@ def test_irradiance_is_that_of_the_inverse_square_law(content, nearest):
     for resolution in (8, 32):
         asset = precompute(content, f"cubemap:{resolution}")
         off = np.pi / 4 / resolution * (8 / 3) ** 0.5 * (1 if nearest == 1 else 3)
-        _, arriving = arrival(light, asset.points.positions, asset.directions)
+        _, arriving = seen(light, asset.points.positions, asset.directions)
         result, expected = asset.irradiance(light, nearest), unoccluded(asset.points, [light])
         assert (np.abs(result - expected) <= arriving * off + 1e-6).all()
         assert abs(bias(result, expected)) < 0.5 / resolution
@@ -157,8 +164,8 @@ def test_strength_falls_with_the_square_and_follows_the_intensity(floor):
     """Exact up to float32 rounding: along one direction from a point, twice the distance is a
     quarter of the light.
     """
-    cells, near = arrival(PointLight([0, 3.0, 0], [1, 2, 3]), np.zeros((1, 3)), floor.directions)
-    again, far = arrival(PointLight([0, 6.0, 0], [1, 2, 3]), np.zeros((1, 3)), floor.directions)
+    cells, near = seen(PointLight([0, 3.0, 0], [1, 2, 3]), np.zeros((1, 3)), floor.directions)
+    again, far = seen(PointLight([0, 6.0, 0], [1, 2, 3]), np.zeros((1, 3)), floor.directions)
     np.testing.assert_array_equal(cells, again)
     np.testing.assert_allclose(near, [[1 / 9, 2 / 9, 3 / 9]], rtol=1e-6)
     np.testing.assert_allclose(far, near / 4, rtol=1e-6)
@@ -175,7 +182,7 @@ def test_extreme_places_give_finite_light(floor):
     is 0, and its cell is at most its radius off.
     """
     at = floor.points.positions[7].astype(np.float64)
-    cells, arriving = arrival(PointLight(at, 1e6), floor.points.positions, floor.directions, 3)
+    cells, arriving = seen(PointLight(at, 1e6), floor.points.positions, floor.directions, 3)
     assert (
         not arriving[7].any()
         and np.isfinite(arriving).all()
@@ -189,7 +196,7 @@ def test_extreme_places_give_finite_light(floor):
     assert not floor.irradiance(PointLight([0.3, -1, 0.2], 5)).any()
     assert floor.irradiance(PointLight([0, 1e30, 0], 1e6)).max() <= 1e6 / 1e30 / 1e30
     grazing = PointLight([0.31, 0, 0.17], 1)
-    _, arriving = arrival(grazing, floor.points.positions, floor.directions)
+    _, arriving = seen(grazing, floor.points.positions, floor.directions)
     assert (floor.irradiance(grazing) <= arriving * np.pi / 4 / 16 * (8 / 3) ** 0.5).all()
 
 
@@ -214,7 +221,7 @@ def test_reference_of_local_lights_is_mitsubas_own():
     alone = [ground_truth.local_irradiance(opened.occluders, points, [light]) for light in lights]
     for light, truth in zip(lights, alone):
         dark = open_scene(box_on_floor())
-        sampled = ground_truth.point_irradiance(lit_scene(dark.mi_scene, light), points, 2)
+        sampled = ground_truth.point_irradiance(lit_scene(dark, light), points, 2)
         assert sampled.noise == 0
         np.testing.assert_allclose(truth, sampled.mean, rtol=1e-6)
         assert 0.02 < (truth == 0).mean() < 0.98
@@ -240,11 +247,10 @@ def test_sampled_reference_of_many_lights_is_unbiased_and_knows_its_noise():
         PointLight([-3, 1, 1], 3.0),
     ]
     alone = [
-        ground_truth.point_irradiance(lit_scene(opened.mi_scene, part), points, 1 << 14, 3)
-        for part in parts
+        ground_truth.point_irradiance(lit_scene(opened, part), points, 1 << 14, 3) for part in parts
     ]
     expected = sum(reference.mean for reference in alone)
-    together = ground_truth.point_irradiance(lit_scene(opened.mi_scene, parts), points, 256, 4)
+    together = ground_truth.point_irradiance(lit_scene(opened, parts), points, 256, 4)
     assert 1 / 1.5 < relative_l2(together.mean, expected) / together.noise < 1.5
     assert together.noise < 0.1
     assert abs(bias(together.mean, expected)) < 0.01
@@ -274,7 +280,7 @@ def test_compression_keeps_local_lights(box):
         box_on_floor(), basis="pca", rays_per_direction=4, coefficients=96, bounces=0
     )
     result = compressed.irradiance(light)
-    cells, arriving = arrival(light, box.points.positions, box.directions)
+    cells, arriving = seen(light, box.points.positions, box.directions)
     rows = compressed.transport(np.arange(len(box.points)))
     np.testing.assert_allclose(
         result,
@@ -303,11 +309,13 @@ def test_irradiance_of_a_sum_is_the_sum_of_irradiances(box):
     nested = [
         parts[0],
         [parts[1], (parts[2],)],
-        Light(directionals=(parts[3],), point_lights=(parts[4],)),
+        Light((parts[3], parts[4])),
         parts[5],
     ]
     light = as_light(nested)
-    assert (len(light.maps), len(light.directionals), len(light.point_lights)) == (2, 2, 2)
+    assert [part.kind for part in light.parts] == ["envmap"] * 2 + ["directional"] * 2 + [
+        "point"
+    ] * 2
     expected = sum(box.irradiance(part).astype(np.float64) for part in parts)
     np.testing.assert_allclose(
         box.irradiance(nested), expected, rtol=1e-5, atol=1e-6 * expected.max()
@@ -322,18 +330,13 @@ def test_turning_turns_distant_light_only(box):
         [EnvironmentMap(uniform_sky()), DirectionalLight([0, 0, -1], 1), PointLight([0, 0, 5], 1)]
     )
     turned = light.rotated("y", 90)  # +z to +x
-    np.testing.assert_allclose(turned.directionals[0].direction, [-1, 0, 0], atol=1e-12)
-    np.testing.assert_array_equal(turned.point_lights[0].position, [0, 0, 5])
-    assert (
-        turned.distant.point_lights == ()
-        and len(turned.distant.maps) == len(turned.distant.directionals) == 1
-    )
-    prepared = box.prepare_light(light)
-    assert (
-        prepared.point_lights == light.point_lights and prepared.directionals == light.directionals
-    )
-    only_lamp = box.prepare_light(light.point_lights[0])
-    np.testing.assert_array_equal(box.irradiance(only_lamp), box.irradiance(light.point_lights[0]))
+    _, sun, lamp = light.parts
+    np.testing.assert_allclose(turned.parts[1].direction, [-1, 0, 0], atol=1e-12)
+    assert turned.parts[2] is lamp and turned.local.parts == (lamp,)
+    assert turned.distant.parts == turned.parts[:2] and turned.distant.local.is_empty
+    assert box.prepare_light(light).parts[1:] == (sun, lamp)
+    only_lamp = box.prepare_light(lamp)
+    np.testing.assert_array_equal(box.irradiance(only_lamp), box.irradiance(lamp))
 
 
 @pytest.mark.parametrize("directions", ["cubemap:16", "latlong:40x20", "halton:1000"])
@@ -467,9 +470,10 @@ def test_warning_inside_the_hull_and_none_outside(room):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         room.irradiance(outside)
-    text = hull_warning([inside] * 5 + [outside], room.points.hull)
-    assert text.startswith("5 local lights") and "…" in text and "\n" not in text
-    assert hull_warning([outside], room.points.hull) is None
+    places = [inside.position] * 5 + [outside.position]
+    text = hull_warning(places, room.points.hull)
+    assert text.startswith("local light at 5 places") and "…" in text and "\n" not in text
+    assert hull_warning([outside.position], room.points.hull) is None
     assert hull_warning([], room.points.hull) is None
 
 
@@ -816,7 +820,7 @@ def test_the_scenes_own_light_beside_others(files, tmp_path, capsys):
 
 @pytest.mark.parametrize("bad", [5, None, {"a": 1}, 1.5, object()], ids=lambda x: type(x).__name__)
 def test_what_is_no_light_is_refused_by_its_kinds(bad):
-    with pytest.raises(LightError, match="DirectionalLight, PointLight or Light"):
+    with pytest.raises(LightError, match="DirectionalLight.* or Light"):
         as_light(bad)
 
 

@@ -18,6 +18,7 @@ from conftest import (
     uniform_directions,
     uniform_sky,
 )
+from mi_prt.lighting.scene_light import chosen_local_light, lit_scene
 
 import mi_prt
 from mi_prt import (
@@ -36,7 +37,6 @@ from mi_prt.lighting.emission import Emission, emission_of, flat_emission
 from mi_prt.lighting.light import Light, as_light
 from mi_prt.lighting.local_emitters import local_scene_light
 from mi_prt.lighting.parse import parse_light
-from mi_prt.lighting.scene_light import chosen_local_light, lit_scene
 from mi_prt.points.points import sample_points
 from mi_prt.scene.scene import open_scene
 from mi_prt.system.runtime import mitsuba
@@ -375,7 +375,7 @@ def test_own_area_emitters_are_mitsubas(name, tmp_path):
     """
     shape = SHAPES[name] or ellipsoid(tmp_path)
     opened = open_scene(scene(floor=rectangle(size=2), lamp=shape | {"emitter": area([3, 2, 1])}))
-    points, truth = truth_on_floor(lit_scene(opened.mi_scene))
+    points, truth = truth_on_floor(lit_scene(opened))
     assert truth.noise < 0.01
     for samples, limit in ((64, 0.03), (256, 0.01)):
         (emission,) = local_scene_light(opened, samples).emissions
@@ -416,7 +416,7 @@ def test_textured_emitters_keep_their_power():
     opened = open_scene(scene(floor=rectangle(size=2), lamp=lamp))
     (emission,) = local_scene_light(opened).emissions
     np.testing.assert_allclose(emission.intensity.sum(axis=0), picture.mean(axis=(0, 1)), rtol=0.02)
-    points, truth = truth_on_floor(lit_scene(opened.mi_scene))
+    points, truth = truth_on_floor(lit_scene(opened))
     result = emission.irradiance(points.positions, points.normals)
     assert (
         relative_l2(result, truth.mean) < 0.02 + 2 * truth.noise
@@ -439,7 +439,7 @@ def test_the_lights_of_a_scene_add_up_and_are_the_same_each_time():
         np.testing.assert_array_equal(
             getattr(emission_of(light), name), getattr(emission_of(again), name)
         )
-    points, truth = truth_on_floor(lit_scene(open_scene(parts).mi_scene))
+    points, truth = truth_on_floor(lit_scene(open_scene(parts)))
     lower = points.at(points.positions[:, 1] < 0.5)
     result = emission_of(light).irradiance(lower.positions, lower.normals)
     # The lamp shades a little of the floor from the bulb: 1 % on average, and nowhere is the floor
@@ -517,7 +517,7 @@ def test_local_emitters_stay_or_go():
     """
     opened = open_scene(lit_room())
     light = PointLight([0.5, 1, 0], [1, 2, 3])
-    kept = lit_scene(opened.mi_scene, light)
+    kept = lit_scene(opened, light)
     assert sorted(e.class_name() for e in kept.emitters()) == [
         "AreaLight",
         "PointLight",
@@ -532,7 +532,7 @@ def test_local_emitters_stay_or_go():
         _, truth = truth_on_floor(lit, 64)
         np.testing.assert_allclose(truth.mean, expected.mean, rtol=1e-5, atol=1e-7)
     with pytest.raises(LightError, match="shape 'lamp' shines"):
-        lit_scene(opened.mi_scene, light, keep_local=False)
+        lit_scene(opened, light, keep_local=False)
     own, again = (
         emission_of(local_scene_light(x)).intensity for x in (opened, open_scene(lit_room()))
     )
@@ -565,7 +565,7 @@ def test_modelled_scene_with_its_local_light():
 def test_emission_of_a_scene_is_no_emitter():
     opened = open_scene(lit_room())
     with pytest.raises(LightError, match="keep_local"):
-        lit_scene(opened.mi_scene, local_scene_light(opened))
+        lit_scene(opened, local_scene_light(opened))
 
 
 def test_chosen_light_tells_what_is_shown():

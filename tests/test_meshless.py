@@ -21,7 +21,7 @@ from mi_prt.directions.hemisphere import Hemisphere
 from mi_prt.evaluate.ground_truth import indirect_irradiance, local_irradiance, point_irradiance
 from mi_prt.lighting.emission import emission_of
 from mi_prt.lighting.light import as_light
-from mi_prt.lighting.scene_light import lit_scene
+from mi_prt.lighting.to_mitsuba import lit_scene
 from mi_prt.points.points import POINT_FIELDS
 from mi_prt.points.samples import scatter_samples
 from mi_prt.scene.scene import open_scene
@@ -481,7 +481,7 @@ def places_in_the_room(count, seed=1):
 def reflected_truth(opened, light, points, paths=1024, bounces=None, seed=0):
     """Indirect irradiance at points by Mitsuba's path tracer, a Reference."""
     return indirect_irradiance(
-        lit_scene(opened.modelled(), as_light(light), keep_local=False),
+        lit_scene(opened, as_light(light), modelled=True),
         points,
         paths,
         bounces,
@@ -544,7 +544,7 @@ def test_spot_and_area_lights_against_mitsuba(room, opened_room, light, most):
     if light is None:
         lit = opened_room.modelled(keep_local=True)
     else:
-        lit = lit_scene(opened_room.modelled(), as_light(light), keep_local=False)
+        lit = lit_scene(opened_room, as_light(light), modelled=True)
     points, index = some(room.points, 150)
     rmse, found, noise = errors(
         room.irradiance(light, "direct"), point_irradiance(lit, room.points, 64)

@@ -8,16 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import bias, diffuse, relative_l2
-from mi_prt.output.export import to_8bit
-from mi_prt.output.relight_local import animate_local
 
 import mi_prt
 from mi_prt import LightError, SettingsError
 from mi_prt.cli import main
 from mi_prt.evaluate import ground_truth
-from mi_prt.lighting.scene_light import lit_scene
+from mi_prt.lighting.to_mitsuba import lit_scene
+from mi_prt.output.export import to_8bit
 from mi_prt.output.film import light_path
 from mi_prt.output.relight import relight_to_file
+from mi_prt.output.relight_local import animate_local
 from mi_prt.scene.scene import open_scene
 from mi_prt.system.runtime import mitsuba
 
@@ -97,7 +97,7 @@ def image(path):
 
 
 def truth(opened, light, spp=1024, depth=-1):
-    lit = lit_scene(opened.unlit(), light, keep_local=False)
+    lit = lit_scene(opened, light)
     return ground_truth.image(lit, lit.sensors()[0], spp, max_depth=depth).mean
 
 

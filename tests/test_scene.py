@@ -12,7 +12,7 @@ from conftest import bias, cube, diffuse, disk, rectangle, relative_l2, scene, s
 
 import mi_prt
 from mi_prt import LightError, SceneError
-from mi_prt.lighting.scene_light import scene_light
+from mi_prt.lighting.from_mitsuba import scene_light
 from mi_prt.scene.scene import open_scene
 from mi_prt.system.runtime import mitsuba
 
@@ -423,7 +423,7 @@ def test_the_modelled_scene_is_diffuse_and_without_local_light():
     del dark_lamp["lamp"]["emitter"]
     original = open_scene(stage(True, **lamps))
     modelled, expected = (
-        rendered(original.modelled()),
+        rendered(original.relit({}, modelled=True)),
         rendered(mi.load_dict(stage(False, **dark_lamp), optimize=False)),
     )
     assert relative_l2(modelled, expected) < 0.03
@@ -435,12 +435,12 @@ def test_the_modelled_scene_is_diffuse_and_without_local_light():
 def test_the_modelled_scene_without_sky_is_black():
     """Only local emitters: with them dark nothing is left, and Mitsuba does not mind."""
     parts = scene(floor=rectangle(), bulb={"type": "point", "position": [0, 2, 0]})
-    assert not rendered(open_scene(parts).modelled(), spp=4).any()
+    assert not rendered(open_scene(parts).relit({}, modelled=True), spp=4).any()
 
 
 def test_a_scene_that_is_modelled_as_written_is_not_copied():
     opened = open_scene(stage(False))
-    assert opened.modelled() is opened.mi_scene
+    assert opened.relit({}, modelled=True) is opened.mi_scene
 
 
 def test_a_loaded_scene_that_would_have_to_change_is_refused():
@@ -448,7 +448,7 @@ def test_a_loaded_scene_that_would_have_to_change_is_refused():
     user's back.
     """
     with pytest.raises(SceneError, match="path or dict"):
-        open_scene(mi.load_dict(stage(True))).modelled()
+        open_scene(mi.load_dict(stage(True))).relit({}, modelled=True)
 
 
 def test_objects_inside_of_a_scene_dict_stay_as_they_are():
@@ -461,7 +461,7 @@ def test_objects_inside_of_a_scene_dict_stay_as_they_are():
     parts = scene(floor=shape, lamp=lamp, sky={"type": "constant"})
     before = shape.bsdf().class_name(), np.array(mi.traverse(lamp)["intensity.value"])
     try:
-        open_scene(parts).modelled()
+        open_scene(parts).relit({}, modelled=True)
     except SceneError:
         pass  # to refuse is fine
     assert shape.bsdf().class_name() == before[0]

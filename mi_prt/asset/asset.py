@@ -9,12 +9,12 @@ import numpy as np
 
 from ..errors import LightError
 from ..lighting.environment import LightWarning
-from ..lighting.light import Light, as_light
+from ..lighting.light import Light
 from ..lighting.own_light import SceneLight, resolve
 from ..points.points import Points
 from ..transport.transport import COMPONENTS, TRANSPORTS, Question
 from . import file
-from .provenance import open_scene_of
+from .provenance import open_scene_of, scene_is_open
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,10 +81,52 @@ class Asset:
         SceneError
             If the scene is needed and not to be had.
         """
-        light = as_light(SceneLight() if light is None else light)
-        if light.of_scene:
-            light = resolve(light, self.emitters, lambda: open_scene_of(self, scene))
+        if light is None:
+            light = self._own_light()
+        names = {emitter["name"]: emitter["distant"] for emitter in self.emitters}
+        opened = scene if scene_is_open(scene) else lambda: open_scene_of(self, scene)
+        light = resolve(light, opened, names)
         return light if rotate is None else light.rotated(*rotate)
+
+    def _own_light(self):
+        """The scene's own light, as far as the asset holds it."""
+        held = {True: "distant" in self.transports}
+        held[False] = any(kind in self.transports for kind in ("own", "local"))
+        names = [emitter["name"] for emitter in self.emitters if held[emitter["distant"]]]
+        if self.emitters and not names:
+            raise LightError(
+                f"of the scene's own lights ({', '.join(self.own_lights)}) this asset, with"
+                f" transports {','.join(self.transports)}, holds none: pass a light (--light), or"
+                " precompute it with other transports (--transports)"
+            )
+        return [SceneLight(name) for name in names] or SceneLight()
+
+    def as_baked(self, scene):
+        """Light of the emitters of a scene as they are now, as far as the asset holds it.
+
+        Parameters
+        ----------
+        scene : Scene
+            Of the asset's geometry. Lamps may have been dimmed, and the sky replaced.
+
+        Returns
+        -------
+        Light
+            Resolved; empty where the asset holds none of it.
+
+        Raises
+        ------
+        LightError
+            If a lamp whose light is baked was changed otherwise than by dimming it.
+        """
+        own = self.transports.get("own")
+        parts = []
+        for part in resolve(SceneLight(), scene).parts if scene.own_lights else ():
+            if own is not None and own.takes(part):
+                part = own.as_baked(part)
+            if any(t.takes(part) or t.stands_in_for(part) for t in self.transports.values()):
+                parts.append(part)
+        return Light(parts)
 
     def prepare_light(self, light=None, scene=None):
         """The same light in a form that turns in milliseconds.
@@ -138,7 +180,7 @@ class Asset:
                     f" {','.join([*self.transports, *wanted])} (--transports)"
                 )
             found.setdefault(transports[0].kind, []).append(part)
-        return {kind: Light(tuple(parts)) for kind, parts in found.items()}
+        return {kind: Light(parts) for kind, parts in found.items()}
 
     @property
     def components(self):

@@ -16,6 +16,7 @@ import stat
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -143,7 +144,7 @@ def _blocks(array, name):
 
 
 def is_asset(path):
-    """Whether a file looks like an asset, of this or an older version; False if it cannot be read."""
+    """Whether a file looks like an asset of any version; False if it cannot be read."""
     try:
         if not stat.S_ISREG(os.stat(path).st_mode):
             return False
@@ -277,7 +278,7 @@ class Stored:
 class _Data:
     """The bytes of all arrays: those of `buffer` from `first` on."""
 
-    buffer: object
+    buffer: Any
     first: int
 
     def __len__(self):

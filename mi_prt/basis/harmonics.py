@@ -5,13 +5,16 @@ that they make.
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import inf, isqrt, pi, sqrt
+from typing import Any
 
 import numpy as np
 import scipy.linalg
 
 from ..errors import SettingsError
-from ..lighting.environment import rotation_matrix
 from ..lighting.light import Light
+from ..lighting.part import DistantPart
+from ..lighting.rotation import rotation_matrix
+from ..lighting.values import rgb_factor
 from .basis import BASES, compute_anew
 from .linear import LinearBasis
 from .rows import Rows
@@ -198,27 +201,27 @@ class HarmonicBasis(LinearBasis):
         turned in closed form.
         """
         functions = str(directions), len(self)
-        known = [m for m in light.maps if isinstance(m, HarmonicMap) and m.functions == functions]
-        others = replace(light, maps=tuple(m for m in light.maps if m not in known))
+        known = [p for p in light.parts if getattr(p, "functions", None) == functions]
+        others = Light(p for p in light.parts if p not in known)
         coefficients, mean = super().project(others, directions)
         return sum((m.turned() for m in known), coefficients), mean
 
     def prepare(self, light, directions):
         """A `Light` whose maps turn in closed form."""
+        maps = Light(part for part in light.parts if part.is_environment)
         prepared = super().prepare(light, directions)
-        maps = tuple(
-            HarmonicMap(
-                m,
-                (str(directions), len(self)),
-                super(HarmonicBasis, self).project(Light(light.maps), directions)[0],
-            )
-            for m in prepared.maps
+        if maps.is_empty:
+            return prepared
+        coefficients = super().project(maps, directions)[0]
+        functions = str(directions), len(self)
+        return Light(
+            HarmonicMap(part, functions, coefficients) if part.is_environment else part
+            for part in prepared.parts
         )
-        return replace(prepared, maps=maps)
 
 
 @dataclass(frozen=True, eq=False)
-class HarmonicMap:
+class HarmonicMap(DistantPart):
     """Environment maps and their spherical harmonics, which turn in closed form.
 
     To a `HarmonicBasis` of the same functions it is its coefficients, to everything else the map.
@@ -234,10 +237,30 @@ class HarmonicMap:
     rotation : (3, 3) float64
     """
 
-    environment: object
+    environment: Any
     functions: tuple
     coefficients: np.ndarray
     rotation: np.ndarray = field(default_factory=lambda: np.eye(3))
+
+    kind = "environment in spherical harmonics"
+    is_environment = True
+    pixels = None  # none of an equirectangular map
+
+    def scaled(self, factor):
+        """See `LightPart.scaled`."""
+        return replace(
+            self,
+            environment=self.environment.scaled(factor),
+            coefficients=self.coefficients * rgb_factor(factor).astype(np.float32),
+        )
+
+    def to_mitsuba(self):
+        """See `LightPart.to_mitsuba`."""
+        return self.environment.to_mitsuba()
+
+    def radiance(self, directions, samples_per_side):
+        """See `DistantPart.radiance`."""
+        return self.environment.radiance(directions, samples_per_side)
 
     def rotated(self, axis, degrees):
         """The same light turned about `axis` (x, y, z or a vector of 3) by `degrees`,
@@ -260,10 +283,6 @@ class HarmonicMap:
     def at(self, vectors):
         """See `LatticeMap`."""
         return self.environment.at(vectors)
-
-    def quadrature(self, spacing):
-        """See `LatticeMap`."""
-        return self.environment.quadrature(spacing)
 
 
 def fit_harmonics(

@@ -5,15 +5,16 @@ explained.
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from ..asset.provenance import open_scene_of
 from ..errors import SettingsError
-from ..lighting.own_light import SceneLight, resolve
 from ..lighting.to_mitsuba import lit_scene
 from ..render.image import pick_sensor, render_image, resized
 from ..render.picture import Picture
+from ..scene.scene import Scene
 from . import ground_truth
 from .local_lights import stand_in_error
 from .near_emitters import near_emitters
@@ -102,7 +103,7 @@ def compare(
     opened = open_scene_of(asset, scene)
     resolved = asset.resolved(light, rotate, opened)
     as_written = reference == "full" and light is None and rotate is None
-    shown = resolve(SceneLight(), opened) if as_written else resolved
+    shown = None if as_written else resolved
     truth = lit_scene(opened, shown, modelled=reference == "modelled")
     picture = Picture(asset, opened, resolved, "total", direct, nearest)
 
@@ -127,7 +128,6 @@ def compare(
         hits = first_hits(truth, camera, IMAGE_SAMPLES, seed)
     progress("report", 3, 3)
 
-    covered = hits.coverage > 1 - 1e-4
     report = {
         "asset": str(asset.path) if asset.path else None,
         "scene": opened.source.path,
@@ -140,10 +140,10 @@ def compare(
         **stand_in_error(asset, resolved, nearest, lambda: opened, seed),
         "points": {"count": len(points.index)} | points.errors(irradiance),
         "components": points.component_errors(picture),
-        "image": image_errors(result, expected, covered, hits.emits),
+        "image": image_errors(result, expected, hits.covered, hits.emits),
         "seconds": {name: round(value, 4) for name, value in seconds.items()},
     }
-    write_report(folder, report, result, expected.mean, covered)
+    write_report(folder, report, result, expected.mean, hits.covered)
     return report
 
 
@@ -154,18 +154,18 @@ class _Points:
     They are drawn where the sensor looks and evenly over all points, half each.
     """
 
-    asset: object
-    opened: object
-    truth: object
-    camera: object
-    bounces: object
+    asset: Any
+    opened: Any
+    truth: Any
+    camera: Any
+    bounces: Any
     seed: int
 
     def __post_init__(self):
         points, seed = self.asset.points, self.seed
         visible = visible_weights(
             self.truth,
-            points.locator(self._wrapped()),
+            points.locator(Scene(self.truth, self.opened.source)),
             len(points),
             self.camera,
             VIEW_SAMPLES,
@@ -178,16 +178,11 @@ class _Points:
         self._visible = visible[self.index] * weights
         chosen = points.at(self.index)
         spacing = np.broadcast_to(points.layout.spacing(points), len(points))[self.index]
-        self._near = near_emitters(self.opened, chosen, spacing)
+        self._near = near_emitters(self.truth, chosen.positions, spacing)
         self._direct = ground_truth.point_irradiance(self.truth, chosen, POINT_SAMPLES, seed)
         self._indirect = ground_truth.indirect_irradiance(
             self.truth, chosen, POINT_PATHS, self.bounces, seed
         )
-
-    def _wrapped(self):
-        from ..scene.scene import Scene
-
-        return Scene(self.truth, self.opened.source)
 
     def errors(self, irradiance, component="total"):
         """Errors of irradiance (n, 3) of all points."""

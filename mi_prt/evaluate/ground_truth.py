@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..lighting.scene_light import point_emitter
 from ..scene.scene import scale_of
 from ..system.runtime import mitsuba
 
@@ -166,7 +165,8 @@ def local_irradiance(mi_scene, points, lights):
     mi_scene : mi.Scene
         Whose shapes cast the shadows; its own emitters do not shine.
     points : Points
-    lights : sequence of PointLight
+    lights : sequence of LightPart
+        Each of one place: point and spot lights.
 
     Returns
     -------
@@ -179,7 +179,7 @@ def local_irradiance(mi_scene, points, lights):
     si = _interactions(mi_scene, points)(dr.arange(mi.UInt32, len(points)))
     total = np.zeros((len(points), 3))
     for light in lights:
-        sample, weight = mi.load_dict(point_emitter(light)).sample_direction(si, mi.Point2f(0.5))
+        sample, weight = mi.load_dict(light.to_mitsuba()).sample_direction(si, mi.Point2f(0.5))
         lit = ~mi_scene.ray_test(si.spawn_ray_to(sample.p))
         total += np.array(_received(si, sample, weight) & lit).T
     return total

@@ -2,12 +2,13 @@
 of emission.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from ..errors import LightError
-from .values import is_finite, numbers
+from .part import LocalPart
+from .values import is_finite, numbers, rgb_factor
 
 _SHAPES = {
     "positions": (3,),
@@ -21,7 +22,7 @@ BLOCK = 1 << 20  # pairs of surface points and emitting places computed at a tim
 
 
 @dataclass(frozen=True, eq=False)
-class Emission:
+class Emission(LocalPart):
     """k places that emit light.
 
     A place with the intensity I sends the irradiance E = I · f(ω) · V · max(0, −ω·n)/r² to a
@@ -45,6 +46,11 @@ class Emission:
         Angle to the axis from which on intensity falls linearly to zero at the cutoff; π if there
         is no such.
 
+    Attributes
+    ----------
+    exact : dict
+        The same arrays by name in float64, as they were given.
+
     Raises
     ------
     LightError
@@ -57,9 +63,13 @@ class Emission:
     cosine: np.ndarray
     cutoff: np.ndarray
     beam: np.ndarray
+    exact: dict = field(init=False, repr=False)
+
+    kind = "emission"
 
     def __post_init__(self):
         count = len(np.atleast_1d(self.positions))
+        exact = {}
         for name, shape in _SHAPES.items():
             values = numbers(getattr(self, name))
             if values.shape != (count, *shape) or not is_finite(values):
@@ -67,7 +77,9 @@ class Emission:
                     f"an emission's {name} must be {(count, *shape)} finite float32 numbers, got"
                     f" shape {values.shape}"
                 )
+            exact[name] = values
             object.__setattr__(self, name, values.astype(np.float32))
+        object.__setattr__(self, "exact", exact)
         if (self.intensity < 0).any():
             raise LightError(
                 f"an emission's intensity must not be negative, got {self.intensity.min():g}"
@@ -76,26 +88,50 @@ class Emission:
     def __len__(self):
         return len(self.positions)
 
-    def shape(self, directions):
+    def emission(self):
+        """Itself; see `LocalPart.emission`."""
+        return self
+
+    def scaled(self, factor):
+        """See `LightPart.scaled`."""
+        return Emission(**self.exact | {"intensity": self.exact["intensity"] * rgb_factor(factor)})
+
+    def to_mitsuba(self):
+        """Refused: see `LightPart.to_mitsuba`.
+
+        Raises
+        ------
+        LightError
+            Always.
+        """
+        raise LightError(
+            f"an emission of {len(self)} places has no emitter in Mitsuba: use point, spot or area"
+            " lights, or the scene's own lamps by their names (scene:NAME)"
+        )
+
+    def shape(self, directions, places=slice(None)):
         """Share of the intensity that is sent in some directions.
 
         Parameters
         ----------
         directions : (…, k, 3)
             Unit vectors, in which the light of each place travels.
+        places : slice
+            Those k that are asked for.
 
         Returns
         -------
         (…, k) float64
             1 along the axis, 0 to 1 elsewhere.
         """
-        cosine = np.clip((directions * self.axes.astype(np.float64)).sum(axis=-1), -1, 1)
-        angle = np.arccos(cosine)
-        transition = np.maximum(self.cutoff - self.beam, np.finfo(np.float32).tiny).astype(
-            np.float64
+        axes, falls, cutoff, beam = (
+            x[places] for x in (self.axes, self.cosine, self.cutoff, self.beam)
         )
-        cone = np.where(angle <= self.beam, 1, np.clip((self.cutoff - angle) / transition, 0, 1))
-        return np.where(self.cosine > 0, np.maximum(cosine, 0), 1) * cone
+        cosine = np.clip((directions * axes.astype(np.float64)).sum(axis=-1), -1, 1)
+        angle = np.arccos(cosine)
+        transition = np.maximum(cutoff - beam, np.finfo(np.float32).tiny).astype(np.float64)
+        cone = np.where(angle <= beam, 1, np.clip((cutoff - angle) / transition, 0, 1))
+        return np.where(falls > 0, np.maximum(cosine, 0), 1) * cone
 
     def irradiance(self, positions, normals):
         """Irradiance of surfaces that see all of it, the sum over all places.
@@ -138,19 +174,17 @@ def emission_of(light):
     Returns
     -------
     Emission
-        Of point lights, spot lights, area lights and emissions, in this order; of no places where
-        there are none.
+        Of the local parts in their order; of no places where there are none.
+
+    Raises
+    ------
+    LightError
+        If a part is one of the scene's own lights that is not resolved.
     """
-    parts = [
-        *map(_point, light.point_lights),
-        *map(_spot, light.spot_lights),
-        *map(_area, light.area_lights),
-        *light.emissions,
-    ]
-    names = [field.name for field in fields(Emission)]
+    parts = [part.emission().exact for part in light.parts if not part.is_distant]
     empty = {name: np.empty((0, *shape)) for name, shape in _SHAPES.items()}
     return Emission(
-        *(np.concatenate([empty[name], *(getattr(part, name) for part in parts)]) for name in names)
+        **{name: np.concatenate([empty[name], *(part[name] for part in parts)]) for name in empty}
     )
 
 
@@ -168,25 +202,3 @@ def flat_emission(positions, normals, intensity):
     return Emission(
         positions, normals, intensity, np.ones(count), np.full(count, np.pi), np.full(count, np.pi)
     )
-
-
-def _point(light):
-    return Emission(light.position[None], [[0, 0, 1]], light.intensity[None], [0], [np.pi], [np.pi])
-
-
-def _spot(light):
-    cutoff, beam = np.radians([[light.cutoff_degrees], [light.beam_degrees]])
-    return Emission(
-        light.position[None], light.direction[None], light.intensity[None], [0], cutoff, beam
-    )
-
-
-def _area(light):
-    side = round(light.samples**0.5)
-    u, v = (np.indices((side, side)).reshape(2, -1, 1) + 0.5) / side - 0.5
-    positions = light.centre + u * light.edge_u + v * light.edge_v
-    normals, intensity = (
-        np.tile(x, (light.samples, 1))
-        for x in (light.normal, light.radiance * light.area / light.samples)
-    )
-    return flat_emission(positions, normals, intensity)

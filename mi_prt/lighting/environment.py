@@ -1,24 +1,34 @@
 """Environment maps: equirectangular radiance in Mitsuba's convention, with a rotation."""
 
+import re
 import warnings
 from copy import copy
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from ..errors import LightError
+from ..system.runtime import mitsuba
+from .average import average, sample_spacing
+from .map_file import read_pixels
+from .part import LIGHTS, DistantPart
+from .rotation import orthonormal, parse_rotation, rotation_matrix
+from .values import rgb_factor
 
 # share of a map's energy beyond which negative pixels are damage, not compression noise
 NEGATIVE_ENERGY_LIMIT = 1e-3
+_TURNED_FILE = re.compile(r"(.+?):([xyz]|[^:,]+,[^:,]+,[^:,]+):([^:]+)")
 
 
 class LightWarning(UserWarning):
     """Lighting that was usable only after a correction; the message counts what was corrected."""
 
 
+@LIGHTS.register
 @dataclass(frozen=True, eq=False)
-class EnvironmentMap:
+class EnvironmentMap(DistantPart):
     """Distant light from an equirectangular map of radiance.
 
     The convention is that of Mitsuba's `envmap`: +y is up, and the point (u, v) of the image looks
@@ -48,14 +58,18 @@ class EnvironmentMap:
         are NaN or infinite, or negative pixels carry more than 1e-3 of the energy.
     """
 
-    source: object = field(repr=False)
+    source: Any = field(repr=False)
     rotation: np.ndarray = field(default_factory=lambda: np.eye(3))
     scale: float = 1.0
     pixels: np.ndarray = field(init=False, repr=False)
     negative_pixels: int = field(init=False, default=0)
 
+    kind = "envmap"
+    FORM = "envmap:FILE or envmap:FILE:AXIS:DEGREES"
+    is_environment = True
+
     def __post_init__(self):
-        pixels, negative = _validated(_read(self.source), self.scale)
+        pixels, negative = _validated(read_pixels(self.source), self.scale)
         object.__setattr__(self, "pixels", pixels)
         object.__setattr__(self, "negative_pixels", negative)
         object.__setattr__(
@@ -71,6 +85,47 @@ class EnvironmentMap:
         turned = copy(self)  # the pixels are checked already
         object.__setattr__(turned, "rotation", rotation_matrix(axis, degrees) @ self.rotation)
         return turned
+
+    def scaled(self, factor):
+        """See `LightPart.scaled`.
+
+        Raises
+        ------
+        LightError
+            If float32 does not hold the result.
+        """
+        with np.errstate(over="ignore"):
+            pixels = self.pixels * rgb_factor(factor).astype(np.float32)
+        if not np.isfinite(pixels).all():
+            raise LightError(f"an environment map times {factor} is not finite in float32")
+        dimmed = copy(self)
+        object.__setattr__(dimmed, "pixels", pixels)
+        object.__setattr__(dimmed, "source", pixels)
+        return dimmed
+
+    @classmethod
+    def parse(cls, text):
+        """See `LightPart.parse`."""
+        turned = _TURNED_FILE.fullmatch(text)
+        if not turned:
+            return cls(text)
+        file, axis, degrees = turned.groups()
+        return cls(file).rotated(*parse_rotation(f"{axis}:{degrees}"))
+
+    def to_mitsuba(self):
+        """See `LightPart.to_mitsuba`."""
+        mi = mitsuba()
+        to_world = np.eye(4)
+        to_world[:3, :3] = self.rotation
+        return {
+            "type": "envmap",
+            "bitmap": mi.Bitmap(self.pixels),
+            "to_world": mi.ScalarTransform4f(to_world),
+        }
+
+    def radiance(self, directions, samples_per_side):
+        """See `DistantPart.radiance`."""
+        return average(self, sample_spacing(directions, samples_per_side), directions)
 
     @property
     def size(self):
@@ -154,109 +209,6 @@ def _theta_moment(theta):
     return np.sin(theta) - theta * np.cos(theta)
 
 
-def rotation_matrix(axis, degrees):
-    """Right-handed rotation about an axis.
-
-    Parameters
-    ----------
-    axis : 'x', 'y', 'z' or sequence of 3 numbers
-        Need not be of unit length.
-    degrees : float
-
-    Returns
-    -------
-    (3, 3) float64
-
-    Raises
-    ------
-    LightError
-        If the axis is unknown, zero or not finite, or the angle is not finite.
-    """
-    named = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1)}
-    vector = np.asarray(named.get(axis, axis) if isinstance(axis, str) else axis)
-    if vector.shape != (3,) or vector.dtype.kind not in "iuf":
-        raise LightError(f"rotation axis must be x, y, z or three numbers, got {axis!r}")
-    length = np.linalg.norm(vector)
-    if not (np.isfinite(length) and length > 0 and np.isfinite(degrees)):
-        raise LightError(
-            f"rotation about {axis!r} by {degrees} degrees is not finite or has no axis"
-        )
-    x, y, z = vector / length
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    angle = np.deg2rad(float(degrees))
-    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
-
-
-def orthonormal(matrix):
-    """The matrix as (3, 3) float64, after checking that it keeps lengths (a rotation or a
-    reflection).
-    """
-    matrix = np.asarray(matrix, dtype=np.float64)
-    if matrix.shape != (3, 3) or not np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-4):
-        raise LightError("an environment's to_world must be a rotation without scale or shear")
-    return matrix
-
-
-def _read(source):
-    if isinstance(source, str | Path):
-        path = Path(source)
-        if not path.is_file():
-            raise LightError(f"environment map '{path}' does not exist")
-        return _read_exr(path) if path.suffix.lower() == ".exr" else _read_by_mitsuba(path)
-    if type(source).__module__.startswith("mitsuba"):
-        return _from_bitmap(source)
-    try:
-        return np.asarray(source)
-    except ValueError:
-        raise LightError(
-            "an environment map is a path, an array (h, w, 3) or a mi.Bitmap, got"
-            f" {type(source).__name__}"
-        ) from None
-
-
-def _read_exr(path):
-    import OpenEXR
-
-    try:
-        with OpenEXR.File(str(path), separate_channels=True) as file:
-            channels = {name: channel.pixels for name, channel in file.channels().items()}
-    except Exception as error:  # OpenEXR raises bare RuntimeErrors
-        raise LightError(
-            f"environment map '{path}' cannot be read as OpenEXR: {_one_line(error)}"
-        ) from None
-    missing = [name for name in "RGB" if name not in channels]
-    if missing:
-        raise LightError(
-            f"environment map '{path}' has the channels {', '.join(sorted(channels)) or 'none'} and"
-            f" lacks {', '.join(missing)}: write it with R, G and B"
-        )
-    return np.stack([channels[name] for name in "RGB"], axis=-1)
-
-
-def _read_by_mitsuba(path):
-    from ..system.runtime import mitsuba
-
-    mi = mitsuba()
-    try:
-        return _from_bitmap(mi.Bitmap(str(path)))
-    except RuntimeError as error:
-        raise LightError(f"environment map '{path}' cannot be read: {_one_line(error)}") from None
-
-
-def _from_bitmap(bitmap):
-    from ..system.runtime import mitsuba
-
-    mi = mitsuba()
-    if not isinstance(bitmap, mi.Bitmap):
-        raise LightError(
-            "an environment map is a path, an array (h, w, 3) or a mi.Bitmap, got"
-            f" {type(bitmap).__name__}"
-        )
-    return np.array(
-        bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=False)
-    )
-
-
 def _validated(pixels, scale):
     if pixels.ndim != 3 or pixels.shape[2] != 3 or 0 in pixels.shape:
         raise LightError(f"an environment map must be of shape (h, w, 3), got {pixels.shape}")
@@ -291,7 +243,3 @@ def _validated(pixels, scale):
         )
         pixels = np.maximum(pixels, 0)
     return pixels, negative
-
-
-def _one_line(error):
-    return " ".join(str(error).split())

@@ -8,38 +8,60 @@ depend on the map's resolution.
 """
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from ..system.parallel import one_blas_thread
+from .average import average, sample_spacing
 from .cells import cell_radiance
-from .environment import rotation_matrix
 from .light import Light, as_light
+from .part import DistantPart
+from .rotation import rotation_matrix
+from .summed import summed_maps
+from .values import rgb_factor
 
 REFINEMENT = 4  # fine cells along the side of a cell of the asset
 SAMPLES_PER_FINE_SIDE = 4
 
 
 @dataclass(frozen=True, eq=False)
-class LatticeMap:
+class LatticeMap(DistantPart):
     """An environment as mean radiance over the cells of a lattice, with a rotation.
 
     Parameters
     ----------
     directions : direction lattice
-    radiance : (s, 3) float32
+    cell_means : (s, 3) float32
+        Radiance of the cells.
     rotation : (3, 3) float64
     """
 
-    directions: object
-    radiance: np.ndarray
+    directions: Any
+    cell_means: np.ndarray
     rotation: np.ndarray
+
+    kind = "environment on a lattice"
+    is_environment = True
+    pixels = None  # none of an equirectangular map
 
     def rotated(self, axis, degrees):
         """The same light turned about `axis` (x, y, z or a vector of 3) by `degrees`,
         right-handed.
         """
         return replace(self, rotation=rotation_matrix(axis, degrees) @ self.rotation)
+
+    def scaled(self, factor):
+        """See `LightPart.scaled`."""
+        return replace(self, cell_means=self.cell_means * rgb_factor(factor).astype(np.float32))
+
+    def to_mitsuba(self):
+        """An environment map that shows the cells; see `LightPart.to_mitsuba`."""
+        return summed_maps([self]).to_mitsuba()
+
+    def radiance(self, directions, samples_per_side):
+        """See `DistantPart.radiance`."""
+        return average(self, sample_spacing(directions, samples_per_side), directions)
 
     @property
     def size(self):
@@ -53,7 +75,7 @@ class LatticeMap:
         """Radiance (k, 3) that arrives from unit directions (k, 3) in world space: that of their
         cells.
         """
-        return self.radiance[self.directions.cells(vectors @ self.rotation)]
+        return self.cell_means[self.directions.cells(vectors @ self.rotation)]
 
     def quadrature(self, spacing):
         """The cells as samples that cover the sphere, in one band; see
@@ -61,7 +83,7 @@ class LatticeMap:
         """
         with one_blas_thread():
             vectors = self.directions.vectors @ self.rotation.T.astype(np.float32)
-        yield vectors, self.directions.solid_angles.astype(np.float32), self.radiance
+        yield vectors, self.directions.solid_angles.astype(np.float32), self.cell_means
 
 
 def on_lattice(light, directions, refinement=REFINEMENT):
@@ -78,12 +100,13 @@ def on_lattice(light, directions, refinement=REFINEMENT):
     Returns
     -------
     Light
-        Whose `rotated` and projection take a few milliseconds. Directional and local lights are as
-        they were.
+        Whose `rotated` and projection take a few milliseconds. All other lights are as they were.
     """
     light = as_light(light)
-    if not light.maps:
+    maps = tuple(part for part in light.parts if part.is_environment)
+    if not maps:
         return light
     fine = directions.refined(refinement)
-    radiance = cell_radiance(Light(light.maps), fine, SAMPLES_PER_FINE_SIDE)
-    return replace(light, maps=(LatticeMap(fine, radiance, np.eye(3)),))
+    radiance = cell_radiance(Light(maps), fine, SAMPLES_PER_FINE_SIDE)
+    others = tuple(part for part in light.parts if not part.is_environment)
+    return Light((LatticeMap(fine, radiance, np.eye(3)), *others))

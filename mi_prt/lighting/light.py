@@ -1,113 +1,83 @@
-"""Light of any kind, distant and local: what counts as light, and sums of it."""
+"""Sums of lights of any kind, and what counts as light."""
 
-from dataclasses import dataclass, field, fields, replace
+import re
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from ..errors import LightError
-from .emission import Emission
-from .environment import EnvironmentMap, rotation_matrix
-from .local_lights import AreaLight, PointLight, SpotLight
-from .values import direction, rgb
+from .environment import EnvironmentMap
+from .parse import parse_light
+from .part import LIGHTS, LightPart
 
-KINDS = (
-    "an environment map (a path, an array (h, w, 3), a mi.Bitmap or EnvironmentMap), an AreaLight,"
-    " SpotLight, DirectionalLight, PointLight or Light"
-)
-
-
-@dataclass(frozen=True, eq=False)
-class DirectionalLight:
-    """Light from a single direction.
-
-    Parameters
-    ----------
-    direction : (3,) array
-        Direction in which the light travels (Mitsuba's `direction`), any positive length.
-    irradiance : (3,) array or float
-        Irradiance on a surface that faces the light, RGB in W/m²; one number is grey.
-
-    Raises
-    ------
-    LightError
-        If a value is not finite, the direction is zero or the irradiance negative.
-    """
-
-    direction: np.ndarray
-    irradiance: np.ndarray
-
-    def __post_init__(self):
-        object.__setattr__(self, "direction", direction(self.direction))
-        object.__setattr__(self, "irradiance", rgb("irradiance", self.irradiance))
-
-    def rotated(self, axis, degrees):
-        """The same light turned about `axis` (x, y, z or a vector of 3) by `degrees`,
-        right-handed.
-        """
-        return DirectionalLight(rotation_matrix(axis, degrees) @ self.direction, self.irradiance)
+_OF_SCENE = re.compile(r"scene([:*].*)?")
 
 
 @dataclass(frozen=True, eq=False)
 class Light:
-    """The sum of any number of distant lights (maps and directionals) and local lights (all
-    others).
+    """The sum of any number of lights, distant and local.
 
     Parameters
     ----------
-    maps : tuple of EnvironmentMap
-    directionals : tuple of DirectionalLight
-    point_lights : tuple of PointLight
-    spot_lights : tuple of SpotLight
-    area_lights : tuple of AreaLight
-    emissions : tuple of Emission
-        What a scene's own emitters of other forms send, see `scene_light.local_scene_light`.
+    parts : iterable of LightPart
+
+    Raises
+    ------
+    LightError
+        If something else is among them.
     """
 
-    maps: tuple = field(default=())
-    directionals: tuple = field(default=())
-    point_lights: tuple = field(default=())
-    spot_lights: tuple = field(default=())
-    area_lights: tuple = field(default=())
-    emissions: tuple = field(default=())
+    parts: tuple = ()
+
+    def __post_init__(self):
+        object.__setattr__(self, "parts", tuple(self.parts))
+        for part in self.parts:
+            if not isinstance(part, LightPart):
+                raise LightError(f"a part of a Light must be one light, got {part!r}: use a list")
 
     @property
     def distant(self):
         """The same without its local lights."""
-        return Light(self.maps, self.directionals)
+        return Light(part for part in self.parts if part.is_distant)
 
     @property
     def local(self):
         """The same without its distant light."""
-        return replace(self, maps=(), directionals=())
+        return Light(part for part in self.parts if not part.is_distant)
 
     @property
     def is_empty(self):
-        """Whether it is the sum of no lights; `light.local.is_empty` tells that all of a light is
-        distant.
+        """Whether it is the sum of no lights; `light.local.is_empty` is true where all of a light
+        is distant.
         """
-        return not any(getattr(self, part.name) for part in fields(self))
+        return not self.parts
+
+    @property
+    def of_scene(self):
+        """Whether lights of the scene are in it that `resolve` has to look up."""
+        return any(part.of_scene for part in self.parts)
 
     def rotated(self, axis, degrees):
         """The same light turned about `axis` (x, y, z or a vector of 3) by `degrees`, right-handed.
 
         Distant light turns; local lights stay where they are.
         """
-        return replace(
-            self,
-            maps=tuple(m.rotated(axis, degrees) for m in self.maps),
-            directionals=tuple(d.rotated(axis, degrees) for d in self.directionals),
-        )
+        return Light(part.rotated(axis, degrees) for part in self.parts)
 
+    def scaled(self, factor):
+        """The same light times a factor: one number or RGB, not negative."""
+        return Light(part.scaled(factor) for part in self.parts)
 
-_PARTS = {
-    EnvironmentMap: "maps",
-    DirectionalLight: "directionals",
-    PointLight: "point_lights",
-    SpotLight: "spot_lights",
-    AreaLight: "area_lights",
-    Emission: "emissions",
-}
+    __array_ufunc__ = None  # so that NumPy leaves `array * light` to the light
+
+    def __mul__(self, factor):
+        return self.scaled(factor)
+
+    __rmul__ = __mul__
+
+    def __add__(self, other):
+        return Light(self.parts + as_light(other).parts)
 
 
 def as_light(light):
@@ -116,7 +86,8 @@ def as_light(light):
     Parameters
     ----------
     light : Light, or any light that it is the sum of, or path, (h, w, 3) array or mi.Bitmap
-        Or a list or tuple of these. A list is the sum of its entries, which may be lists themselves.
+        Or the text of the scene's own light ("scene", "scene:lamp_2*0.3"), or a list or tuple of
+        these. A list is the sum of its entries, which may be lists themselves.
 
     Raises
     ------
@@ -125,16 +96,18 @@ def as_light(light):
     """
     if isinstance(light, Light):
         return light
-    for kind, name in _PARTS.items():
-        if isinstance(light, kind):
-            return Light(**{name: (light,)})
+    if isinstance(light, LightPart):
+        return Light((light,))
+    if isinstance(light, str) and _OF_SCENE.fullmatch(light):
+        return Light((parse_light(light),))
     if isinstance(light, str | Path | np.ndarray) or type(light).__module__.startswith("mitsuba"):
-        return Light(maps=(EnvironmentMap(light),))
+        return Light((EnvironmentMap(light),))
     if not isinstance(light, list | tuple):
-        raise LightError(f"light must be {KINDS}, or a list of these, got {light!r}")
+        kinds = ", ".join(kind.__name__ for kind in LIGHTS.values())
+        raise LightError(
+            "light must be an environment map (a path, an array (h, w, 3) or a mi.Bitmap), a light"
+            f" ({kinds} or Light), 'scene', or a list of these, got {light!r}"
+        )
     if not light:
         raise LightError("the list of lights is empty: pass one light at least")
-    parts = [as_light(part) for part in light]
-    return Light(
-        **{name: sum((getattr(part, name) for part in parts), ()) for name in _PARTS.values()}
-    )
+    return Light(sum((as_light(part).parts for part in light), ()))

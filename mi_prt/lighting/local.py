@@ -11,92 +11,77 @@ that is the same only where the light is outside the convex hull of the scene.
 
 import numpy as np
 
-from ..errors import LightError
-
-NAMED_LIGHTS = 3  # places that a warning names
+NAMED_PLACES = 3  # places that a warning names
 
 
-def arrival(light, positions, directions, nearest=1):
-    """Where a local light is seen from, and how strongly it shines there.
+def arrival(emission, positions, directions, nearest=1):
+    """Where each place of local light is seen from, and how strongly it shines there.
 
-    The irradiance of point i is E_i = irradiance_i · mean over its cells j of T_ij (Eigentransport
-    eq. 4 with the cells' radiance I/(k r² w_j)).
+    The irradiance of point i is E_i = Σ irradiance_i · mean over its cells j of T_ij, a sum over
+    the places (Eigentransport eq. 4 with the cells' radiance I f(ω)/(k r² w_j)).
 
     Parameters
     ----------
-    light : PointLight
+    emission : Emission
     positions : (n, 3)
         World space, m.
     directions : direction lattice
     nearest : int
-        Number k of directions that stand for the light, those nearest to its own.
+        Number k of directions that stand for a place, those nearest to its own.
 
-    Returns
-    -------
+    Yields
+    ------
     cells : (n, k) int64
         Indices of directions.
     irradiance : (n, 3) float32
-        I/r² in W/m², on a surface that faces the light; at most the largest float32. Zero at a
-        point in which the light stands: it has no direction there.
+        I f(ω)/r² in W/m², on a surface that faces the place; at most the largest float32. Zero at a
+        point in which the place lies: it has no direction there.
 
     Raises
     ------
     SettingsError
         If `nearest` is not in 1…s.
     """
-    toward = light.position - np.asarray(positions, dtype=np.float64)
-    distance = np.linalg.norm(toward, axis=1, keepdims=True)
-    here = distance[:, 0] == 0
-    toward[here], distance[here] = [0, 0, 1], 1
-    with np.errstate(over="ignore"):
-        irradiance = light.intensity / distance / distance
-    irradiance[here] = 0
-    cells = directions.nearest(toward, nearest)
-    return cells, np.minimum(irradiance, np.finfo(np.float32).max).astype(np.float32)
+    positions = np.asarray(positions, dtype=np.float64)
+    for i, (place, intensity) in enumerate(
+        zip(emission.exact["positions"], emission.exact["intensity"])
+    ):
+        toward = place - positions
+        distance = np.linalg.norm(toward, axis=1, keepdims=True)
+        here = distance[:, 0] == 0
+        toward[here], distance[here] = [0, 0, 1], 1
+        share = emission.shape((-toward / distance)[:, None], slice(i, i + 1))
+        with np.errstate(over="ignore"):
+            irradiance = intensity * share / distance / distance
+        irradiance[here] = 0
+        cells = directions.nearest(toward, nearest)
+        yield cells, np.minimum(irradiance, np.finfo(np.float32).max).astype(np.float32)
 
 
-def refuse_all_but_point_lights(light):
-    """Raise a LightError if a Light holds local lights that distant transport cannot be lit by: any
-    but point lights.
-    """
-    others = {
-        "spot": light.spot_lights,
-        "area": light.area_lights,
-        "emission of the scene": light.emissions,
-    }
-    found = " and ".join(
-        f"{len(lights)} {kind} light(s)" for kind, lights in others.items() if lights
-    )
-    if found:
-        raise LightError(
-            f"of local lights, transport of distant light takes point lights only, got {found}:"
-            " precompute the scene with points='samples', or use point lights outside of it"
-        )
-
-
-def hull_warning(lights, hull):
-    """What there is to say of local lights that stand inside the convex hull of a scene.
+def hull_warning(positions, hull):
+    """What there is to say of local light inside the convex hull of a scene.
 
     Parameters
     ----------
-    lights : sequence of PointLight
+    positions : (k, 3)
+        Of the places that emit it.
     hull : ConvexHull
         That of the scene's points, which is a little smaller than that of curved shapes.
 
     Returns
     -------
     str or None
-        None where all stand outside.
+        None where all lie outside.
     """
-    inside = [light.position for light in lights if hull.contains(light.position)]
+    inside = [place for place in np.asarray(positions, np.float64) if hull.contains(place)]
     if not inside:
         return None
-    places = "; ".join("{:g}, {:g}, {:g}".format(*position) for position in inside[:NAMED_LIGHTS])
-    places += "; …" if len(inside) > NAMED_LIGHTS else ""
+    named = "; ".join("{:g}, {:g}, {:g}".format(*place) for place in inside[:NAMED_PLACES])
+    named += "; …" if len(inside) > NAMED_PLACES else ""
     who = (
-        f"the local light at {places} lies"
+        f"the local light at {named} lies"
         if len(inside) == 1
-        else f"{len(inside)} local lights (at {places}) lie"
+        else f"local light at {len(inside)} places ({named}) lies"
     )
     return (
         f"{who} inside the convex hull of the scene, where visibility to infinity is not the"

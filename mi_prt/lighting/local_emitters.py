@@ -8,7 +8,8 @@ from ..scene.traversal import children, transform_of
 from ..system.runtime import mitsuba
 from .emission import flat_emission
 from .light import as_light
-from .local_lights import PointLight, SpotLight
+from .point import PointLight
+from .spot import SpotLight
 
 EMITTER_SAMPLES = 64  # places that stand for one area emitter
 SAMPLES_PER_PLACE = 64  # of radiance, in the part of an emitter that a place stands for
@@ -44,14 +45,15 @@ def local_scene_light(scene, samples=EMITTER_SAMPLES):
     SettingsError
         If `samples` is not an integer ≥ 1.
     """
-    if isinstance(samples, bool) or not isinstance(samples, int | np.integer) or samples < 1:
-        raise SettingsError(f"samples of an emitter must be an integer ≥ 1, got {samples!r}")
+    _check(samples)
     if not scene.local_emitters:
         raise LightError("the scene has no local light (point, spot, area): pass a light, --light")
-    return as_light([_light_of(emitter, samples) for emitter in scene.local_emitters])
+    return as_light([local_part(emitter, samples) for emitter in scene.local_emitters])
 
 
-def _light_of(emitter, samples):
+def local_part(emitter, samples=EMITTER_SAMPLES):
+    """One local emitter of Mitsuba as a part of light; see `local_scene_light`."""
+    _check(samples)
     kind = emitter.class_name()
     shape = emitter.get_shape()
     name = (
@@ -71,6 +73,11 @@ def _light_of(emitter, samples):
         raise LightError(
             f"{name} cannot be taken as light: {' '.join(str(error).split())}; pass a light instead"
         ) from None
+
+
+def _check(samples):
+    if isinstance(samples, bool) or not isinstance(samples, int | np.integer) or samples < 1:
+        raise SettingsError(f"samples of an emitter must be an integer ≥ 1, got {samples!r}")
 
 
 def _as_seen_from(emitter, direction):

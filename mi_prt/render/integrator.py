@@ -47,8 +47,8 @@ def _plugin_class(variant):
     class PRTIntegrator(mi.SamplingIntegrator):
         """Precomputed radiance transfer (`prt`).
 
-        Shows a scene under its emitters with the transports of an asset. The irradiance at the asset's points is
-        interpolated at each hit and multiplied by the albedo there, so textures keep their own
+        Shows a scene under its emitters with the transports of an asset. The irradiance at the
+        asset's points is interpolated at each hit and multiplied by the albedo there, so textures keep their own
         resolution; emitters and the background are shown as Mitsuba's own integrators show them.
 
         Parameters (plugin)

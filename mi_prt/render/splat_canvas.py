@@ -5,7 +5,7 @@ Importing this module opens OpenGL.
 
 import numpy as np
 
-from .canvas import GL, SHADERS, ShaderProgramCache, make_current
+from .canvas import GL, SHADERS, ShaderProgramCache, make_current  # pyright: ignore[reportAttributeAccessIssue]
 
 
 class SplatCanvas:

@@ -4,28 +4,13 @@ The rest is named, not dropped in silence.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from ..system.runtime import mitsuba
+from .models import MATERIALS, black
 from .traversal import children
-
-# Class names of Mitsuba's materials, and the texture that holds their diffuse albedo.
-_DIFFUSE_TEXTURE = {
-    "SmoothPlastic": "diffuse_reflectance",
-    "RoughPlastic": "diffuse_reflectance",
-    "Principled": "base_color",
-    "PrincipledThin": "base_color",
-}
-_LEFT_OUT = {
-    "SmoothPlastic": "specular coat",
-    "RoughPlastic": "glossy coat",
-    "Principled": "specular, sheen, clearcoat and transmission lobes",
-    "PrincipledThin": "specular, sheen and transmission lobes",
-    "BumpMap": "bumps",
-    "NormalMap": "normal map",
-    "MaskBSDF": "opacity (treated as opaque)",
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,8 +31,8 @@ class Material:
         What is not modelled, for example "conductor: all of its reflection".
     """
 
-    bsdf: object
-    modelled: object
+    bsdf: Any
+    modelled: Any
     two_sided: bool
     textured: bool
     left_out: tuple
@@ -79,8 +64,7 @@ class Material:
 def model_material(bsdf):
     """Diffuse model of a BSDF, see Material."""
     mi = mitsuba()
-    left_out = []
-    modelled = _model(bsdf, left_out)
+    modelled, left_out = _model(bsdf)
     two_sided = mi.has_flag(modelled.flags(), mi.BSDFFlags.BackSide)
     textured = any(
         key.endswith((".data", "color0.value")) or "vertex_" in key
@@ -129,8 +113,8 @@ class Facing:
     geometric, shading : mi.Normal3f
     """
 
-    geometric: object
-    shading: object
+    geometric: Any
+    shading: Any
 
 
 def facing(si, ray, surfaces):
@@ -165,49 +149,9 @@ def facing(si, ray, surfaces):
     return Facing(outer * side, shading * side), mi.Vector3f(0, 0, side), reflects
 
 
-def _model(bsdf, left_out):
-    mi = mitsuba()
+def _model(bsdf):
+    """The modelled BSDF, and texts of what is left out; see `scene.models`."""
     kind = bsdf.class_name()
-    below = children(bsdf)
-    if kind == "SmoothDiffuse":
-        return bsdf
-    if kind in ("TwoSidedBRDF", "BlendBSDF"):
-        nested = [c for name, c in below if isinstance(c, mi.BSDF)]
-        modelled = [_model(c, left_out) for c in nested]
-        if all(a is b for a, b in zip(nested, modelled)):
-            return bsdf
-        if kind == "TwoSidedBRDF":
-            # What has a back already (glass, a nested twosided) needs no second one.
-            if any(mi.has_flag(m.flags(), mi.BSDFFlags.BackSide) for m in modelled):
-                return modelled[0]
-            return mi.load_dict(
-                {"type": "twosided", **{f"side{i}": m for i, m in enumerate(modelled)}}
-            )
-        weight = dict(below)["weight"]
-        return mi.load_dict(
-            {"type": "blendbsdf", "weight": weight, "first": modelled[0], "second": modelled[1]}
-        )
-    if kind in ("BumpMap", "NormalMap", "MaskBSDF"):
-        left_out.append(f"{kind}: {_LEFT_OUT[kind]}")
-        return _model(next(c for _, c in below if isinstance(c, mi.BSDF)), left_out)
-    if kind in _DIFFUSE_TEXTURE:
-        left_out.append(f"{kind}: {_LEFT_OUT[kind]}")
-        textures = dict(below)
-        diffuse = mi.load_dict({"type": "diffuse", "reflectance": textures[_DIFFUSE_TEXTURE[kind]]})
-        for share in ("metallic", "spec_trans"):
-            if share in textures:  # that share of the surface has no diffuse lobe
-                diffuse = mi.load_dict(
-                    {
-                        "type": "blendbsdf",
-                        "weight": textures[share],
-                        "first": diffuse,
-                        "second": _black(),
-                    }
-                )
-        return diffuse
-    left_out.append(f"{kind}: all of its scattering (treated as black)")
-    return _black()
-
-
-def _black():
-    return mitsuba().load_dict({"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}})
+    if kind not in MATERIALS:
+        return black(), (f"{kind}: all of its scattering (treated as black)",)
+    return MATERIALS[kind](bsdf, children(bsdf), _model)

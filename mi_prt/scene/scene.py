@@ -2,18 +2,20 @@
 
 import hashlib
 import os
-import re
 from collections import Counter
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from ..errors import SceneError
 from ..system.runtime import a_worker_at_least, mitsuba
-from .materials import Material, model_material
-from .traversal import children, digest_of, transform_of
+from .own_lights import list_own_lights
+from .rebuild import check_can_be_copied, kept_parts, rebuilt_scene
+from .surface import list_surfaces
+from .traversal import children, digest_of
 
 
 @dataclass(frozen=True)
@@ -34,51 +36,7 @@ class SceneSource:
     kind: str
     path: str | None = None
     parameters: dict = field(default_factory=dict)
-    content: object = field(default=None, repr=False, compare=False)
-
-
-@dataclass(frozen=True, eq=False)
-class Surface:
-    """One shape as it stands in the world: a shape of the scene, or one shape of an instanced
-    group.
-
-    Parameters
-    ----------
-    name : str
-        The shape's id; of instanced shapes "instance/shape".
-    shape : mi.Shape
-    instance : mi.Shape or None
-    to_world : (4, 4) float64
-        The instance's transform; identity for plain shapes.
-    material : Material
-    """
-
-    name: str
-    shape: object
-    instance: object
-    to_world: np.ndarray
-    material: Material
-
-    @property
-    def kind(self):
-        """'mesh', or the plugin's class name: Sphere, Cylinder, Disk, …"""
-        return "mesh" if self.shape.is_mesh() else self.shape.class_name()
-
-    @cached_property
-    def signature(self):
-        """Kind and place of an analytic shape as text, the same each time the scene is loaded; ''
-        for meshes.
-        """
-        if self.kind == "mesh":
-            return ""
-        if "to_world" not in mitsuba().traverse(self.shape):
-            return (
-                f"{self.kind} {self.shape.bbox()}"
-                f" {digest_of([self.shape], lambda key: '.' not in key)}"
-            )
-        place = self.to_world @ transform_of(self.shape)
-        flipped = " flipped" if self.shape.has_flipped_normals() else ""
-        return self.kind + flipped + " " + " ".join(f"{x:.6g}" for x in place[:3].ravel() + 0.0)
+    content: Any = field(default=None, repr=False, compare=False)
 
 
 class Scene:
@@ -91,7 +49,10 @@ class Scene:
     source : SceneSource
     surfaces : tuple of Surface
         In the order of the scene's shapes.
-    distant_emitters, local_emitters : tuple of mi.Emitter
+    own_lights : tuple of OwnLight
+        Its emitters in the scene's order. Each is named by the id of the shape that shines or of
+        the emitter; where Mitsuba made that up, `lamp_3` is the third local light and `sky_1` the
+        first distant one. A second light of a name is `name#2`.
 
     Raises
     ------
@@ -100,41 +61,26 @@ class Scene:
     """
 
     def __init__(self, mi_scene, source):
-        mi = mitsuba()
         self.mi_scene = mi_scene
         self.source = source
         self._children = children(mi_scene)
-        self.surfaces = tuple(self._list_surfaces())
+        self.surfaces = tuple(list_surfaces(mi_scene))
         if not self.surfaces:
             raise SceneError("the scene holds no shapes: there is nothing to light")
         empty = [s.name for s in self.surfaces if s.kind == "mesh" and s.shape.face_count() == 0]
         if empty:  # Dr.Jit cannot read from arrays without entries
             raise SceneError(f"the mesh '{empty[0]}' has no faces: remove it from the scene")
-        emitters = mi_scene.emitters()
-        is_distant = [mi.has_flag(e.flags(), mi.EmitterFlags.Infinite) for e in emitters]
-        self.distant_emitters = tuple(e for e, distant in zip(emitters, is_distant) if distant)
-        self.local_emitters = tuple(e for e, distant in zip(emitters, is_distant) if not distant)
+        self.own_lights = list_own_lights(mi_scene)
 
-    def _list_surfaces(self):
-        groups = {c.id(): c for _, c in self._children if c.class_name() == "ShapeGroupPlugin"}
-        models = {}
+    @property
+    def distant_emitters(self):
+        """mi.Emitters whose light comes from infinity, a tuple."""
+        return tuple(own.emitter for own in self.own_lights if own.is_distant)
 
-        def material(shape):
-            bsdf = shape.bsdf()
-            if bsdf not in models:
-                models[bsdf] = model_material(bsdf)
-            return models[bsdf]
-
-        for i, shape in enumerate(self.mi_scene.shapes()):
-            if shape.class_name() != "Instance":
-                yield Surface(_name(shape, i), shape, None, np.eye(4), material(shape))
-                continue
-            members = [
-                c for _, c in children(groups[_group_of(shape)]) if isinstance(c, mitsuba().Shape)
-            ]
-            for j, member in enumerate(members):
-                name = f"{_name(shape, i)}/{_name(member, j)}"
-                yield Surface(name, member, shape, transform_of(shape), material(member))
+    @property
+    def local_emitters(self):
+        """All other mi.Emitters, a tuple."""
+        return tuple(own.emitter for own in self.own_lights if not own.is_distant)
 
     @cached_property
     def scale(self):
@@ -189,45 +135,50 @@ class Scene:
             "vertices": sum(m.vertex_count() for m in meshes),
         }
 
-    def modelled(self, keep_local=False):
-        """The scene that the transport stands for: diffuse reflection only, local emitters dark or,
-        with `keep_local`, as they are.
+    def relit(self, factors, modelled=False):
+        """The scene with its lamps dimmed and, if asked for, with modelled materials.
+
+        Parameters
+        ----------
+        factors : dict
+            Of its local lights by name (see `own_lights`), numbers or RGB (3,); those that are not
+            there are dark. Distant lights stay as they are.
+        modelled : bool
+            Whether materials are those that transport stands for: their diffuse parts.
 
         Returns
         -------
         mi.Scene
-            A fresh scene where something has to be changed; this one is left as it is.
+            The scene itself where nothing has to be changed; else a new one, with watertight
+            intersections, and this one is left as it is.
+
+        Raises
+        ------
+        LightError
+            If a name is not one of a lamp, a factor is negative or not finite, or a lamp cannot be
+            dimmed.
+        SceneError
+            If the scene was given as Mitsuba objects and would have to be changed.
+        """
+        distant = [own.name for own in self.own_lights if own.is_distant]
+        parts = kept_parts(self, factors, modelled, distant)
+        changed = set(map(id, self._lit_objects())) ^ set(map(id, parts))
+        return rebuilt_scene(parts) if changed else self.mi_scene
+
+    def _lit_objects(self):
+        mi = mitsuba()
+        return [c for _, c in self._children if isinstance(c, mi.Shape | mi.Sensor | mi.Emitter)]
+
+    def copy(self):
+        """The same scene opened again, whose objects are others.
 
         Raises
         ------
         SceneError
-            If the scene was given as an mi.Scene and would have to be changed.
+            If it was given as Mitsuba objects.
         """
-        return self._changed(
-            [i for i, s in enumerate(self.surfaces) if s.material.left_out], keep_local
-        )
-
-    def unlit(self):
-        """The scene as written, but for its local emitters, which are dark; see `modelled`."""
-        return self._changed([], keep_local=False)
-
-    def _changed(self, replaced, keep_local):
-        """The scene with the modelled materials on some surfaces, and local emitters kept or
-        dark.
-        """
-        if not replaced and (keep_local or not self.local_emitters):
-            return self.mi_scene
-        if self.source.kind == "object" or _holds_objects(self.source.content):
-            raise SceneError(
-                "a scene given as Mitsuba objects cannot be rebuilt with diffuse materials and"
-                " without local emitters: pass its path or dict, or compare with reference 'full'"
-            )
-        copy = open_scene(self.source.path or self.source.content, self.source.parameters)
-        for i in replaced:
-            copy.surfaces[i].shape.set_bsdf(copy.surfaces[i].material.modelled)
-        for emitter in () if keep_local else copy.local_emitters:
-            _darken(emitter)
-        return copy.mi_scene
+        check_can_be_copied(self, _holds_objects(self.source.content))
+        return open_scene(self.source.path or self.source.content, self.source.parameters)
 
 
 def open_scene(source, parameters=None):
@@ -280,33 +231,6 @@ def _loaded(what, load, *arguments, **parameters):
     return scene
 
 
-def rebuilt_scene(parts, additions=None):
-    """A new mi.Scene with watertight intersections, of objects of another and of plugin dicts.
-
-    Parameters
-    ----------
-    parts : list of mi.Object
-        They keep their ids (Mitsuba renames what it is given by the keys of the dict).
-    additions : dict, optional
-        Entries of a scene dict.
-
-    Returns
-    -------
-    mi.Scene
-    """
-    ids = [part.id() for part in parts]
-    entries = {f"part{i}": part for i, part in enumerate(parts)} | (additions or {})
-    try:
-        return mitsuba().load_dict(
-            {"type": "scene", "embree_use_robust_intersections": True, **entries},
-            optimize=False,
-            parallel=False,
-        )
-    finally:
-        for part, name in zip(parts, ids):
-            part.set_id(name)
-
-
 def scale_of(mi_scene):
     """Length that offsets and tolerances are measured by: the bounding box's diagonal or the
     largest coordinate.
@@ -356,25 +280,8 @@ def _holds_objects(content):
     """Whether a scene dict contains loaded objects, which a second scene of it would share."""
     if isinstance(content, dict):
         return any(_holds_objects(entry) for entry in content.values())
-    return isinstance(content, mitsuba().Object)
-
-
-def _name(shape, index):
-    """A shape's id; one that Mitsuba made up (it holds an address, which changes at each run) is
-    replaced.
-    """
-    made_up = not shape.id() or re.fullmatch(r"(object|_unnamed)_\d+", shape.id())
-    return f"{shape.class_name()}-{index}" if made_up else shape.id()
-
-
-def _group_of(instance):
-    """Id of the shape group that an instance shows. Only its printed form tells."""
-    found = re.search(r'ShapeGroup\[\s*name = "([^"]*)"', str(instance))
-    if not found:
-        raise SceneError(
-            f"the shape group of instance '{instance.id()}' cannot be told: expand it into shapes"
-        )
-    return found[1]
+    mi = mitsuba()
+    return isinstance(content, mi.Object) and not isinstance(content, mi.Bitmap)
 
 
 def _is_appearance(key):
@@ -385,27 +292,3 @@ def _is_appearance(key):
         "vertex_positions",
         "vertex_normals",
     )
-
-
-def is_dark(emitter):
-    """Whether an emitter sends no light."""
-    parameters = mitsuba().traverse(emitter)
-    return not any(
-        np.any(np.array(parameters[key]))
-        for key in _emitted(parameters)
-        if key != "sampling_weight"
-    )
-
-
-def _darken(emitter):
-    parameters = mitsuba().traverse(emitter)
-    for key in _emitted(parameters):
-        parameters[key] = parameters[key] * 0
-    parameters.update()
-
-
-def _emitted(parameters):
-    """Keys of what an emitter's light is proportional to, and of how often it is sampled."""
-    kinds = ("radiance", "intensity", "irradiance", "sampling_weight")
-    # it iterates over pairs
-    return [key for key in parameters.keys() if key.split(".")[0] in kinds and "to_uv" not in key]
