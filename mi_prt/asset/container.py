@@ -102,7 +102,7 @@ def _dtype(array):
 def _head(path, header, arrays):
     """Length and header in bytes, filled up with blanks."""
     end = 0
-    table = {
+    table: dict[str, Any] = {
         "__metadata__": {
             "format": FORMAT,
             "format_version": str(FORMAT_VERSION),

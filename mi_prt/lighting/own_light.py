@@ -4,8 +4,6 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
-import numpy as np
-
 from ..errors import LightError
 from .from_mitsuba import distant_part
 from .light import Light, as_light
@@ -37,7 +35,7 @@ class SceneLight(LightPart):
     """
 
     name: str | None = None
-    factor: np.ndarray = 1.0
+    factor: Any = 1.0  # stored as (3,) float64
     turns: tuple = field(default=())
 
     kind = "scene"
@@ -108,7 +106,7 @@ class Lamp(LocalPart):
     """
 
     name: str
-    factor: np.ndarray = 1.0
+    factor: Any = 1.0  # stored as (3,) float64
     own: Any = None
 
     kind = "lamp"
@@ -237,4 +235,4 @@ class _OwnLights:
     def _own_lights(self):
         if self._scene is None:
             raise LightError("the scene's own light is needed: pass the scene, or another light")
-        return (self._scene if self.is_open else self._scene()).own_lights
+        return (self._scene if self.is_open else self._scene()).own_lights  # pyright: ignore[reportAttributeAccessIssue]

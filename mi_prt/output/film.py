@@ -235,11 +235,12 @@ def _write_mp4(path, images, fps):
 
 def _write_gif(path, images, fps):
     import av
+    import av.filter
 
     first = to_8bit(next(images))
     height, width = first.shape[:2]
     graph = av.filter.Graph()  # a palette for each frame, so that no two frames must be in memory
-    source = graph.add_buffer(width=width, height=height, format="rgb24", time_base=1 / fps)
+    source = graph.add_buffer(width=width, height=height, format="rgb24", time_base=1 / fps)  # pyright: ignore[reportArgumentType]
     copies, sink = graph.add("split"), graph.add("buffersink")
     palette, applied = (
         graph.add("palettegen", "stats_mode=single"),

@@ -48,8 +48,9 @@ def _plugin_class(variant):
         """Precomputed radiance transfer (`prt`).
 
         Shows a scene under its emitters with the transports of an asset. The irradiance at the
-        asset's points is interpolated at each hit and multiplied by the albedo there, so textures keep their own
-        resolution; emitters and the background are shown as Mitsuba's own integrators show them.
+        asset's points is interpolated at each hit and multiplied by the albedo there, so textures
+        keep their own resolution; emitters and the background are shown as Mitsuba's own
+        integrators show them.
 
         Parameters (plugin)
         -------------------
@@ -217,7 +218,7 @@ def integrator_for(asset, irradiance=None, direct="points"):
             raise SettingsError(
                 f"irradiance must be of shape ({len(asset.points)}, 3), got {irradiance.shape}"
             )
-    return _plugin_class(mi.variant())(mi.Properties("prt"), asset, irradiance, direct)
+    return _plugin_class(mi.variant())(mi.Properties("prt"), asset, irradiance, direct)  # pyright: ignore[reportCallIssue]
 
 
 def _load(filename):
