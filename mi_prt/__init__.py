@@ -14,9 +14,7 @@ from .system.llvm import select_llvm
 
 select_llvm()  # before anything can load Dr.Jit: an LLVM that is too old would end the process
 
-from .asset.asset import Asset
-from .asset.meshless_asset import MeshlessAsset
-from .asset.opening import load
+from .asset.asset import Asset, load
 from .errors import (
     AssetError,
     InputError,
@@ -49,7 +47,6 @@ __all__ = [
     "Light",
     "LightError",
     "LightWarning",
-    "MeshlessAsset",
     "PointLight",
     "PrtError",
     "RuntimeSetupError",

@@ -16,7 +16,6 @@ import stat
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -102,7 +101,7 @@ def _dtype(array):
 def _head(path, header, arrays):
     """Length and header in bytes, filled up with blanks."""
     end = 0
-    table: dict[str, Any] = {
+    table: dict[str, dict] = {
         "__metadata__": {
             "format": FORMAT,
             "format_version": str(FORMAT_VERSION),
@@ -144,7 +143,7 @@ def _blocks(array, name):
 
 
 def is_asset(path):
-    """Whether a file looks like an asset of any version; False if it cannot be read."""
+    """Whether a file looks like an asset, of this or an older version; False if it cannot be read."""
     try:
         if not stat.S_ISREG(os.stat(path).st_mode):
             return False
@@ -278,7 +277,7 @@ class Stored:
 class _Data:
     """The bytes of all arrays: those of `buffer` from `first` on."""
 
-    buffer: Any
+    buffer: mmap.mmap
     first: int
 
     def __len__(self):

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from ..errors import SceneError
 from ..lighting.environment import LightWarning
-from ..scene.scene import open_scene
+from ..scene.scene import Scene, open_scene
 
 
 def describe_scene(scene, points, transports):
@@ -22,6 +22,13 @@ def describe_scene(scene, points, transports):
         "appearance": scene.appearance,
         "left_out": left_out(scene, points, transports),
     }
+
+
+def emitter_records(scene):
+    """What an asset records of a scene's emitters: name, kind, distant (a list of dict)."""
+    return [
+        {"name": own.name, "kind": own.kind, "distant": own.is_distant} for own in scene.own_lights
+    ]
 
 
 def left_out(scene, points, transports):
@@ -126,6 +133,11 @@ def open_scene_of(asset, scene=None, parameters=None):
             stacklevel=2,
         )
     return opened
+
+
+def scene_is_open(scene):
+    """Whether this is a Scene, and not what one could be opened from."""
+    return isinstance(scene, Scene)
 
 
 def _check_place(path):

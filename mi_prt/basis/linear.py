@@ -123,3 +123,14 @@ class LinearBasis(Basis):
             [self.vectors[:, channel] @ weighted[:, channel] for channel in range(3)], axis=-1
         )
         return light, np.einsum("cs,sc->c", mean, weighted)
+
+
+class Span(LinearBasis):
+    """What a basis and its mean span together, itself without a mean."""
+
+    kind = "span"
+
+    @classmethod
+    def fit(cls, rows, target, seed=0, progress=None, max_bytes=0, keep=None):
+        """Refused: a span is made from a basis."""
+        raise TypeError("a span is made from a basis, not fitted")

@@ -14,7 +14,7 @@ import numpy as np
 import scipy.linalg
 
 from ..system.parallel import map_chunks, one_blas_thread
-from .linear import LinearBasis
+from .linear import LinearBasis, Span
 from .pca import PCA, fixed_signs
 from .target import Fit, shares
 
@@ -82,7 +82,7 @@ def carrier(basis):
     if size > _IN_SPAN * np.linalg.norm(mean):
         vectors = np.concatenate([vectors, (beyond / size)[None].astype(np.float32)])
     return Carrier(
-        LinearBasis(vectors, np.zeros_like(basis.mean), basis.sqrt_weights, np.zeros(len(vectors))),
+        Span(vectors, np.zeros_like(basis.mean), basis.sqrt_weights, np.zeros(len(vectors))),
         random,
     )
 

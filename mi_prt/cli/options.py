@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from ..errors import SettingsError
-from ..lighting.parse import FORMS
+from ..lighting.parse import forms
 from ..precompute.options import Flag
 from ..precompute.settings import OPTIONS
 
@@ -42,7 +42,7 @@ Lights = Annotated[
     typer.Option(
         "--light",
         metavar="SPEC",
-        help=f"{FORMS}. One number is grey; W/sr, W/m², W/(m² sr), degrees. May be repeated: lights"
+        help=f"{forms()}. One number is grey; W/sr, W/m², W/(m² sr), degrees. May be repeated: lights"
         " add up, also to --envmap.",
     ),
 ]

@@ -3,7 +3,8 @@
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ..scene.scene import is_dark, mesh_arrays
+from ..scene.own_lights import is_dark
+from ..scene.scene import mesh_arrays
 from ..scene.traversal import transform_of
 from ..system.runtime import mitsuba
 

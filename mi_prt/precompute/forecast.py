@@ -5,7 +5,7 @@ from dataclasses import asdict
 
 import numpy as np
 
-from ..asset.provenance import left_out
+from ..asset.provenance import emitter_records, left_out
 from ..points.points import POINT_BUDGET
 from ..scene.scene import open_scene
 from ..system.memory import free_bytes, resident_bytes
@@ -56,7 +56,7 @@ def describe(source, parameters=None, **settings):
     memory = held + max(cost.pop("memory") for cost in costs.values())
     return {
         "requires": requires,
-        "lights": [light.as_dict() for light in scene.own_lights],
+        "lights": emitter_records(scene),
         "settings": _settings(plan, job.points, reasons, costs),
         "left_out": left_out(scene, job.points, plan.transports),
         "predicted": {

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ..asset.asset import Asset
-from ..asset.provenance import describe_scene
+from ..asset.provenance import describe_scene, emitter_records
 from ..errors import SettingsError
 from ..points.clusters import make_clusters
 from ..points.points import Points, sample_points
@@ -234,8 +234,8 @@ def _built(job, plan, builders):
     return Asset(
         job.points,
         transports,
-        tuple(light.as_dict() for light in scene.own_lights),
-        scene=describe_scene(scene, transports),
+        tuple(emitter_records(scene)),
+        scene=describe_scene(scene, job.points, transports),
         settings=used,
         versions=versions(),
         report={"buried_points": int(job.points.buried.sum()), "reasons": plan.reasons},

@@ -209,9 +209,7 @@ class DistantTransport(Transport):
             shapes = {f"basis/{key}": a for key, a in basis.shapes(count).items()}
             shapes |= basis.coefficient_shapes(count)
             # each set has components of its own; directions are shared
-            found |= {
-                f"{name}/{key}": a.renamed({"d": f"d of {name}"}) for key, a in shapes.items()
-            }
+            found |= {f"{name}/{key}": a.within(name, ("n", "s")) for key, a in shapes.items()}
         return found
 
     def arrays(self):

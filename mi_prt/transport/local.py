@@ -52,11 +52,11 @@ class LocalTransport(Transport):
     @classmethod
     def is_for(cls, part):
         """Local lights that are not the scene's own."""
-        return not part.is_distant and part.lamp is None
+        return not part.is_distant and part.own_name is None
 
     def stands_in_for(self, part):
         """Lamps of the scene, as places that emit."""
-        return part.lamp is not None
+        return part.own_name is not None
 
     @property
     def reflects(self):

@@ -56,11 +56,11 @@ class OwnTransport(Transport):
     @classmethod
     def is_for(cls, part):
         """Lamps of the scene."""
-        return part.lamp is not None
+        return part.own_name is not None
 
     def takes(self, part):
         """Lamps whose columns it holds."""
-        return part.lamp is not None and part.lamp in self.names
+        return part.own_name in self.names
 
     @property
     def reflects(self):
@@ -73,13 +73,40 @@ class OwnTransport(Transport):
         for part in question.light.parts:
             if not self.takes(part):
                 raise LightError(
-                    f"lamp '{part.lamp}' is not in this asset: {', '.join(self.names)}"
+                    f"lamp '{part.own_name}' is not in this asset: {', '.join(self.names)}"
                 )
-            factors[self.names.index(part.lamp)] += np.asarray(part.factor, np.float32)
+            factors[self.names.index(part.own_name)] += np.asarray(part.factor, np.float32)
         columns = {"direct": self.direct, "indirect": self.indirect, "total": self._total}
         with one_blas_thread():
             mixed = np.matmul(columns[question.component], factors.T[..., None])
         return np.ascontiguousarray(mixed[..., 0].T)
+
+    def as_baked(self, lamp):
+        """A lamp of an open scene as a factor of the baked one.
+
+        Parameters
+        ----------
+        lamp : Lamp
+
+        Raises
+        ------
+        LightError
+            If more of it changed than its strength.
+        """
+        baked = self.lamps[self.names.index(lamp.own_name)]
+        now, then = lamp.own.strength, baked["strength"]
+        unlike = lamp.own.digest() != baked["digest"] or (now is None) != (then is None)
+        if not unlike and now is not None:
+            then = np.asarray(then)
+            unlike = bool(((then == 0) & (now != 0)).any())
+        if unlike:
+            raise LightError(
+                f"lamp '{lamp.own_name}' was moved, turned or repainted since its light was baked:"
+                " precompute the scene again, or with the transport local (--transports)"
+            )
+        if now is None or (now == then).all():
+            return lamp
+        return lamp.scaled(np.divide(now, then, out=np.zeros(3), where=then != 0))
 
     @cached_property
     def _total(self):
