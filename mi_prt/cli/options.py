@@ -42,8 +42,8 @@ Lights = Annotated[
     typer.Option(
         "--light",
         metavar="SPEC",
-        help=f"{forms()}. One number is grey; W/sr, W/m², W/(m² sr), degrees. May be repeated: lights"
-        " add up, also to --envmap.",
+        help=f"{forms()}. One number is grey; W/sr, W/m², W/(m² sr), degrees. May be repeated:"
+        " lights add up, also to --envmap.",
     ),
 ]
 Component = Annotated[

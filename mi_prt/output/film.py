@@ -261,6 +261,6 @@ def _write_gif(path, images, fps):
             frame = av.VideoFrame.from_ndarray(image, format="rgb24")
             frame.pts, frame.time_base = count - 1, 1 / fps
             graph.push(frame)
-            file.mux(stream.encode(graph.pull()))
+            file.mux(stream.encode(graph.pull()))  # pyright: ignore[reportArgumentType]
         file.mux(stream.encode())
         return count

@@ -110,7 +110,7 @@ def _plugin_class(variant):
             hit = active & si.is_valid()
 
             # --- light that the surface reflects
-            irradiance, found = self._locator.interpolated(self._irradiance, pi, si, ray, hit)
+            irradiance, found = self._locator.interpolated(self._irradiance, pi, si, ray, hit)  # pyright: ignore[reportOptionalMemberAccess]
             if self._emitters is not None:
                 irradiance += self._emitters.irradiance(si, ray, sampler, hit)
                 found = hit
@@ -225,6 +225,6 @@ def _load(filename):
     import mitsuba as mi
 
     try:
-        return load(str(mi.file_resolver().resolve(filename)))
+        return load(str(mi.file_resolver().resolve(filename)))  # pyright: ignore[reportCallIssue]
     except InputError:
         return load(filename)
