@@ -19,11 +19,12 @@ from pathlib import Path
 
 import matplotlib
 import numpy as np
+from mi_prt.basis.bases import fit_basis
+from mi_prt.precompute.info import storage_bytes
 from page import ROOT, saved, write_page
 
 import mi_prt
 from mi_prt import LightWarning
-from mi_prt.basis.bases import fit_basis
 from mi_prt.basis.rows import Rows
 from mi_prt.basis.target import Target
 from mi_prt.directions import Cubemap
@@ -34,7 +35,6 @@ from mi_prt.lighting.from_mitsuba import scene_light
 from mi_prt.lighting.lattice import on_lattice
 from mi_prt.lighting.to_mitsuba import lit_scene
 from mi_prt.points.points import sample_points
-from mi_prt.precompute.info import storage_bytes
 from mi_prt.render.display import display, exposure
 from mi_prt.render.image import coverage, pick_sensor, render_image, resized
 from mi_prt.scene.scene import open_scene
@@ -68,10 +68,12 @@ def main():
 
 HEAD = """# The Eigentransport paper, measured
 
-Made by `benchmarks/eigentransport.py` on two CPU cores. Paper: Nowrouzezahrai, Simari, Kalogerakis, Fiume: *Eigentransport for Efficient
-and Accurate All-Frequency Relighting* (2007); figure and section numbers are the paper's. Directions are `cubemap:32` (6,144) unless
-said otherwise. Errors of transport are ‖T − T̂‖/‖T‖ over the fitted rows (at most 20,000 points that see the sky, picked at random), in the
-norm of the sphere: each direction weighs its solid angle. Meshes have a largest extent of 2 m; planes are 8 m wide."""
+Made by `benchmarks/eigentransport.py` on two CPU cores. Paper: Nowrouzezahrai, Simari,
+Kalogerakis, Fiume: *Eigentransport for Efficient and Accurate All-Frequency Relighting* (2007);
+figure and section numbers are the paper's. Directions are `cubemap:32` (6,144) unless said
+otherwise. Errors of transport are ‖T − T̂‖/‖T‖ over the fitted rows (at most 20,000 points that
+see the sky, picked at random), in the norm of the sphere: each direction weighs its solid angle.
+Meshes have a largest extent of 2 m; planes are 8 m wide."""
 
 
 # --- scenes and transport -------------------------------------------------------------------------

@@ -42,8 +42,9 @@ def main():
 
 HEAD = """# Reflected light, measured
 
-Made by `benchmarks/interreflection.py` on two CPU cores. Directions are `cubemap:32` unless said otherwise; errors are relative RMSE at points that are
-not buried, with the reference's own noise taken out. How reflections are computed, and why this way, is in [architecture](architecture.md)."""
+Made by `benchmarks/interreflection.py` on two CPU cores. Directions are `cubemap:32` unless said
+otherwise; errors are relative RMSE at points that are not buried, with the reference's own noise
+taken out. How reflections are computed, and why this way, is in [architecture](architecture.md)."""
 
 
 # --- sections -------------------------------------------------------------------------------------

@@ -13,11 +13,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from conftest import diffuse, disk, emitted, rectangle, scene, sky_of, sphere
+from mi_prt.points.interpolate import PatchInterpolator
 
 import mi_prt
 from mi_prt.errors import SceneError, SettingsError
 from mi_prt.lighting.from_mitsuba import scene_light
-from mi_prt.points.interpolate import PatchInterpolator
 from mi_prt.points.points import sample_points
 from mi_prt.render.display import display, exposure
 from mi_prt.render.image import render_image, resized
@@ -420,7 +420,9 @@ PROGRAM = """
 import sys, numpy as np
 from test_raster import diffuse, linear, opened, rectangle, sphere
 scene, asset, sensor = opened(
-    floor=rectangle(bsdf=diffuse([0.2, 0.5, 0.8])), ball=sphere(radius=0.5, bsdf=diffuse()), sky={"type": "constant"}
+    floor=rectangle(bsdf=diffuse([0.2, 0.5, 0.8])),
+    ball=sphere(radius=0.5, bsdf=diffuse()),
+    sky={"type": "constant"},
 )
 np.save(sys.argv[1], linear(asset, scene, sensor, asset.irradiance(None)))
 """

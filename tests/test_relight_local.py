@@ -8,16 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import bias, diffuse, relative_l2
+from mi_prt.output.export import to_8bit
+from mi_prt.output.relight_local import animate_local
 
 import mi_prt
 from mi_prt import LightError, SettingsError
 from mi_prt.cli import main
 from mi_prt.evaluate import ground_truth
 from mi_prt.lighting.to_mitsuba import lit_scene
-from mi_prt.output.export import to_8bit
 from mi_prt.output.film import light_path
 from mi_prt.output.relight import relight_to_file
-from mi_prt.output.relight_local import animate_local
 from mi_prt.scene.scene import open_scene
 from mi_prt.system.runtime import mitsuba
 

@@ -29,7 +29,7 @@ class Registry(Mapping):
         Raised for an unknown name, an `InputError`.
     """
 
-    def __init__(self, what, package, error=SettingsError):
+    def __init__(self, what, package, error: type[Exception] = SettingsError):
         self._what, self._package, self._error = what, package, error
         self._kinds, self._complete = {}, False
 
