@@ -12,7 +12,7 @@ import time
 
 import numpy as np
 import pytest
-from conftest import cube, diffuse, disk, rectangle, scene
+from conftest import cube, diffuse, disk, distant, rectangle, scene
 
 import mi_prt
 import mi_prt.system.runtime
@@ -81,7 +81,8 @@ def undisturbed(files):
 def test_the_runs_are_three(files):
     """Coloured reflections, and another result by each way to them."""
     assets = {name: mi_prt.load(path) for name, path in files.items()}
-    assert {name: (asset.report["bounces"], asset.channels) for name, asset in assets.items()} == {
+    found = {name: distant(asset) for name, asset in assets.items()}
+    assert {name: (one.report["bounces"], one.channels) for name, one in found.items()} == {
         "direct": (0, 1),
         "solve": (2, 3),
         "paths": (2, 3),
@@ -301,7 +302,11 @@ def test_too_many_coefficients_cost_no_rays(tmp_path):
         progress=lambda *event: seen.append(event),
         **settings,
     )
-    assert len(asset.basis) == rank == 5 and seen[0][:3] == ("transport", seen[0][2], seen[0][2])
+    assert len(distant(asset).basis) == rank == 5 and seen[0][:3] == (
+        "transport",
+        seen[0][2],
+        seen[0][2],
+    )
 
 
 def test_a_workspace_belongs_to_one_process(tmp_path):
@@ -453,7 +458,7 @@ def test_reflections_that_are_solved_for_do_not_depend_on_threads_and_blocks(
     }
     settings = dict(directions="cubemap:8", edge_length=0.3, bounces=bounces, paths_per_point=32)
     mi_prt.precompute(scene(**walls), output=tmp_path / "a.prt", **settings)
-    assert mi_prt.load(tmp_path / "a.prt").report["bounces"] > MOST_SUMMED_BOUNCES
+    assert distant(mi_prt.load(tmp_path / "a.prt")).report["bounces"] > MOST_SUMMED_BOUNCES
     monkeypatch.setattr(room, "LANES", LANES)
     before = mitsuba_threads()
     mi_prt.system.runtime.set_threads(3)
@@ -489,7 +494,7 @@ def test_passes_of_a_fit_that_failed_do_not_reach_another(tmp_path, monkeypatch)
     """A search for a share of the variance starts its later fits from earlier ones. When it fails
     and so many components are asked for outright, that fit is the one of an undisturbed run.
     """
-    module, tried = sys.modules["mi_prt.precompute.precompute"], []
+    module, tried = sys.modules["mi_prt.precompute.distant"], []
     leading = pca._leading
     monkeypatch.setattr(
         pca, "_leading", lambda *arguments: tried.append(arguments[2]) or leading(*arguments)
@@ -515,7 +520,7 @@ def test_paths_kept_in_a_span_that_was_given_up_do_not_reach_another(tmp_path, m
     it. As many coefficients as the first fit had, asked for outright, have another span by a
     little: the paths of an undisturbed run are told in that one.
     """
-    module, fits = sys.modules["mi_prt.precompute.precompute"], []
+    module, fits = sys.modules["mi_prt.precompute.distant"], []
     walls = {
         name: rectangle(normal, -np.array(normal), 1)
         for name, normal in dict(a=(0, 1, 0), b=(1, 0, 0), c=(0, 0, 1)).items()
