@@ -467,8 +467,8 @@ def test_the_same_seed_gives_the_same_file_within_a_process(kind, saved, tmp_pat
 PROGRAM = """
 import sys, mi_prt
 red = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.8, 0.3, 0.2]}}
-parts = {"type": "scene", "ball": {"type": "sphere", "center": [0, 1, 0], "bsdf": red}, "box": {"type": "cube"},
-         "extra": {"type": "disk"}}
+ball = {"type": "sphere", "center": [0, 1, 0], "bsdf": red}
+parts = {"type": "scene", "ball": ball, "box": {"type": "cube"}, "extra": {"type": "disk"}}
 settings = dict(directions="cubemap:8", edge_length=0.5, paths_per_point=64)
 asset = mi_prt.precompute(parts, indirect=sys.argv[2], **settings)
 assert asset.transports["distant"].channels == 3

@@ -302,11 +302,8 @@ def test_too_many_coefficients_cost_no_rays(tmp_path):
         progress=lambda *event: seen.append(event),
         **settings,
     )
-    assert len(distant(asset).basis) == rank == 5 and seen[0][:3] == (
-        "transport",
-        seen[0][2],
-        seen[0][2],
-    )
+    assert len(distant(asset).basis) == rank == 5
+    assert seen[0][:3] == ("transport", seen[0][2], seen[0][2])
 
 
 def test_a_workspace_belongs_to_one_process(tmp_path):
