@@ -132,8 +132,8 @@ def test_bases_of_direct_light_refuse_reflections(basis):
     """They hold direct transport only: that is their default, and anything else is refused with the
     way out.
     """
-    assert Settings(basis=basis).bounces == 0
-    assert Settings(basis=basis, bounces=0).bounces == 0
+    assert Settings(basis=basis).distant_bounces == 0
+    assert Settings(basis=basis, bounces=0).distant_bounces == 0
     for bounces in (1, "auto"):
         with pytest.raises(
             SettingsError, match=f"basis {basis} holds direct transport only, got bounces {bounces}"
@@ -285,20 +285,16 @@ def test_energy_told_of_each_reflection():
 @pytest.mark.parametrize(
     ("setting", "value", "message"),
     [
-        ("bounces", -1, "bounces must be auto or 0…10000, got -1"),
-        ("bounces", 10_001, "bounces must be auto or 0…10000, got 10001"),
+        ("bounces", -1, "bounces must be 0…10,000 or auto, got -1"),
+        ("bounces", 10_001, "bounces must be 0…10,000 or auto, got 10001"),
         ("bounces", 2.5, "bounces must be an integer or auto, got 2.5"),
         ("bounces", "many", "bounces must be an integer or auto, got 'many'"),
         ("bounces", True, "bounces must be an integer or auto, got True"),
         ("bounces", float("nan"), "bounces must be an integer or auto, got nan"),
-        ("paths_per_point", 0, "paths per point must be auto or an even number 2…65,536, got 0"),
-        ("paths_per_point", 3, "paths per point must be auto or an even number 2…65,536, got 3"),
-        (
-            "paths_per_point",
-            65_538,
-            "paths per point must be auto or an even number 2…65,536, got 65538",
-        ),
-        ("paths_per_point", None, "paths_per_point must be an integer or auto, got None"),
+        ("paths_per_point", 0, "paths per point must be 2…65,536 or auto, got 0"),
+        ("paths_per_point", 3, "paths per point must be auto or an even number, got 3"),
+        ("paths_per_point", 65_538, "paths per point must be 2…65,536 or auto, got 65538"),
+        ("paths_per_point", None, "paths per point must be an integer or auto, got None"),
         ("denoise", "yes", "denoise must be true or false, got 'yes'"),
         ("denoise", 1, "denoise must be true or false, got 1"),
         ("indirect", "x", "indirect 'x' is not known: use solve or paths"),
