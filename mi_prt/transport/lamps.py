@@ -15,7 +15,7 @@ TOLERANCE = 0.01
 # share of a lamp's mean irradiance below which a point's error is measured against that share
 DIM = 0.05
 GROUPS = 8  # sequences of each point and lamp; their spread is the error
-PILOT = 4  # samples of each sequence before the first look at the error
+PILOT = 8  # samples of each sequence before the first look at the error
 MOST_SAMPLES = 1024  # of each point and lamp, all sequences together
 MEAN_POINTS = 1024  # that tell the mean irradiance of a lamp
 HEMISPHERE = 0x5BD1E995  # makes of a sequence another
@@ -30,8 +30,8 @@ class DirectLight:
     irradiance : (n, k, 3) float32
         W/m².
     standard_error : (n, k) float32
-        Of the irradiance, norm over the channels, from eight sequences; too small by about a third
-        in the mean, as doubling ends where it looks small.
+        Of the irradiance, norm over the channels, from eight sequences. Doubling ends where it looks
+        small, so that in the mean it is a few percent too small.
     rays : int
         Shadow rays traced.
     """
@@ -71,10 +71,10 @@ def direct_light(
         Local emitters of the scene: point, spot, projector, and area on any shape.
     tolerance : float
         Standard error that is aimed at, as a share of the irradiance of a lamp at a point, or of
-        `DIM` times its mean where the point receives less. Samples are doubled from 32 on until it
+        `DIM` times its mean where the point receives less. Samples are doubled from 64 on until it
         is met.
     most_samples : int
-        Where doubling ends; a power of two ≥ 32.
+        Where doubling ends; a power of two ≥ 64.
     seed : int
     lanes : int
         Most lanes of one wavefront. Results do not depend on it.
