@@ -30,8 +30,8 @@ class DirectLight:
     irradiance : (n, k, 3) float32
         W/m².
     standard_error : (n, k) float32
-        Of the irradiance, norm over the channels, from eight sequences. Doubling ends where it looks
-        small, so that in the mean it is a few percent too small.
+        Of the irradiance, norm over the channels, from eight sequences. Doubling ends where it
+        looks small, so that in the mean it is a few percent too small.
     rays : int
         Shadow rays traced.
     """
