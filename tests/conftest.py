@@ -3,7 +3,7 @@
 Scenes are y-up, lengths in metres.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.stats
@@ -226,7 +226,6 @@ class SampledScene:
         sampler = HopSampler(
             self.scene,
             self.points,
-            self.buried,
             self.transport,
             self.directions,
             rays,
@@ -276,6 +275,6 @@ def sampled(parts, edge_length, directions="cubemap:16", rays_per_direction=1):
     points, lattice = sample_points(opened, edge_length), parse_directions(directions)
     transport = sample_direct(opened, points, lattice, rays_per_direction)
     buried = find_buried(opened, points, transport.dark())
-    return SampledScene(
-        opened, points, lattice, transport, buried, blocked_share(transport, lattice.solid_angles)
-    )
+    blocked = blocked_share(transport, lattice.solid_angles)
+    points = replace(points, buried=buried)
+    return SampledScene(opened, points, lattice, transport, buried, blocked)
