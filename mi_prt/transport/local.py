@@ -73,10 +73,10 @@ class LocalTransport(Transport):
 
     def _direct_light(self, points):
         """The LocalDirect of the points; what it holds in Dr.Jit is made once."""
-        if id(points) not in self._direct:
-            self._direct.clear()
-            self._direct[id(points)] = LocalDirect(points, self.clusters, self.depth)
-        return self._direct[id(points)]
+        if self._direct.get("points") is not points:
+            made = LocalDirect(points, self.clusters, self.depth)
+            self._direct.update(points=points, kernel=made)
+        return self._direct["kernel"]
 
     def _indirect(self, averaged):
         """Indirect irradiance (n, 3); what compression leaves of it below zero is zero."""
