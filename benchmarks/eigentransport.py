@@ -19,22 +19,22 @@ from pathlib import Path
 
 import matplotlib
 import numpy as np
+from mi_prt.basis.bases import fit_basis
+from mi_prt.precompute.info import storage_bytes
 from page import ROOT, saved, write_page
 
 import mi_prt
 from mi_prt import LightWarning
-from mi_prt.basis.bases import fit_basis
 from mi_prt.basis.rows import Rows
 from mi_prt.basis.target import Target
 from mi_prt.directions import Cubemap
 from mi_prt.evaluate import metrics
 from mi_prt.evaluate.ground_truth import image, point_irradiance
 from mi_prt.lighting.cells import cell_radiance
-from mi_prt.lighting.lattice import on_lattice
 from mi_prt.lighting.from_mitsuba import scene_light
+from mi_prt.lighting.lattice import on_lattice
 from mi_prt.lighting.to_mitsuba import lit_scene
 from mi_prt.points.points import sample_points
-from mi_prt.precompute.info import storage_bytes
 from mi_prt.render.display import display, exposure
 from mi_prt.render.image import coverage, pick_sensor, render_image, resized
 from mi_prt.scene.scene import open_scene
@@ -68,10 +68,12 @@ def main():
 
 HEAD = """# The Eigentransport paper, measured
 
-Made by `benchmarks/eigentransport.py` on two CPU cores. Paper: Nowrouzezahrai, Simari, Kalogerakis, Fiume: *Eigentransport for Efficient
-and Accurate All-Frequency Relighting* (2007); figure and section numbers are the paper's. Directions are `cubemap:32` (6,144) unless
-said otherwise. Errors of transport are ‖T − T̂‖/‖T‖ over the fitted rows (at most 20,000 points that see the sky, picked at random), in the
-norm of the sphere: each direction weighs its solid angle. Meshes have a largest extent of 2 m; planes are 8 m wide."""
+Made by `benchmarks/eigentransport.py` on two CPU cores. Paper: Nowrouzezahrai, Simari,
+Kalogerakis, Fiume: *Eigentransport for Efficient and Accurate All-Frequency Relighting* (2007);
+figure and section numbers are the paper's. Directions are `cubemap:32` (6,144) unless said
+otherwise. Errors of transport are ‖T − T̂‖/‖T‖ over the fitted rows (at most 20,000 points that
+see the sky, picked at random), in the norm of the sphere: each direction weighs its solid angle.
+Meshes have a largest extent of 2 m; planes are 8 m wide."""
 
 
 # --- scenes and transport -------------------------------------------------------------------------
@@ -546,9 +548,7 @@ def local_lights(assets, pictures):
     chosen = np.sort(np.random.default_rng(0).permutation(len(pca.points))[:4000])
     for height in (20.0, 8.0, 4.0, 2.5, 1.6, 1.1, 0.6):
         light = mi_prt.PointLight((1.2, height, 0.8), 100.0)
-        truth = point_irradiance(
-            lit_scene(sampled.scene, light), pca.points.at(chosen), 1
-        ).mean
+        truth = point_irradiance(lit_scene(sampled.scene, light), pca.points.at(chosen), 1).mean
         results = pca.irradiance(light), pca.irradiance(light, nearest=4), none.irradiance(light)
         figures = [
             f(result[chosen], truth)

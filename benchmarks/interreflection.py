@@ -42,8 +42,9 @@ def main():
 
 HEAD = """# Reflected light, measured
 
-Made by `benchmarks/interreflection.py` on two CPU cores. Directions are `cubemap:32` unless said otherwise; errors are relative RMSE at points that are
-not buried, with the reference's own noise taken out. How reflections are computed, and why this way, is in [architecture](architecture.md)."""
+Made by `benchmarks/interreflection.py` on two CPU cores. Directions are `cubemap:32` unless said
+otherwise; errors are relative RMSE at points that are not buried, with the reference's own noise
+taken out. How reflections are computed, and why this way, is in [architecture](architecture.md)."""
 
 
 # --- sections -------------------------------------------------------------------------------------
@@ -286,9 +287,7 @@ def _against_mitsuba(scene, asset, seconds):
     paths = 64
     errors, spent = [], 0.0
     for direction in directions.vectors[few]:
-        lit = lit_scene(
-            scene, mi_prt.DirectionalLight(direction=-direction, irradiance=(1, 1, 1))
-        )
+        lit = lit_scene(scene, mi_prt.DirectionalLight(direction=-direction, irradiance=(1, 1, 1)))
         # compiles
         ground_truth.indirect_irradiance(lit, asset.points.at(np.arange(64)), paths, BOUNCES)
         started = time.perf_counter()

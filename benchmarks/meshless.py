@@ -21,11 +21,11 @@ from pathlib import Path
 from unittest import mock
 
 import numpy as np
+from mi_prt.asset.meshless_file import compressed
 from page import plt, saved, write_page
 from scipy.spatial import cKDTree
 
 import mi_prt
-from mi_prt.asset.meshless_file import compressed
 from mi_prt.basis.clustered import leading_components
 from mi_prt.evaluate import ground_truth, metrics
 from mi_prt.evaluate.ground_truth import Reference
@@ -97,11 +97,14 @@ def main():
 
 HEAD = """# Light that moves inside a scene, measured
 
-Made by `benchmarks/meshless.py` on two CPU cores. Settings are the defaults of `mi-prt precompute --points samples` unless said otherwise. Errors are
-relative RMSE over points, ‖result − truth‖ / ‖truth‖; the truth's own noise is taken out. Direct light is compared with Mitsuba's shadow rays, which
-have no noise. For reflected light Mitsuba's `path` is too noisy: where a path happens to come near a lamp that stands by a wall it brings back a spike. The
-truth here is a bidirectional estimate with Mitsuba's intersections and BSDFs: wherever light was reflected last but one is told both by rays from the
-receiver and by rays from the lamp, weighted by the balance heuristic, so that no sample is large; [accuracy](#accuracy) has it next to `path`."""
+Made by `benchmarks/meshless.py` on two CPU cores. Settings are the defaults of `mi-prt precompute
+--points samples` unless said otherwise. Errors are relative RMSE over points, ‖result − truth‖ /
+‖truth‖; the truth's own noise is taken out. Direct light is compared with Mitsuba's shadow rays,
+which have no noise. For reflected light Mitsuba's `path` is too noisy: where a path happens to
+come near a lamp that stands by a wall it brings back a spike. The truth here is a bidirectional
+estimate with Mitsuba's intersections and BSDFs: wherever light was reflected last but one is told
+both by rays from the receiver and by rays from the lamp, weighted by the balance heuristic, so
+that no sample is large; [accuracy](#accuracy) has it next to `path`."""
 
 
 # --- sections -------------------------------------------------------------------------------------

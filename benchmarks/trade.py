@@ -52,9 +52,7 @@ def main():
             if truths is None:
                 chosen = np.sort(np.random.default_rng(0).permutation(len(asset.points))[:2000])
                 at = asset.points.at(chosen)
-                truths = [
-                    irradiance(lit_scene(scene, light), at, 8192, 2048) for light in lights
-                ]
+                truths = [irradiance(lit_scene(scene, light), at, 8192, 2048) for light in lights]
             projected = [asset.project_light(light) for light in lights]
             results = np.stack([asset.irradiance_from(*light)[chosen] for light in projected])
             expected = np.stack([truth.mean for truth in truths])

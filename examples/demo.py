@@ -8,13 +8,13 @@ import argparse
 import time
 from pathlib import Path
 
+from mi_prt.output.relight_local import animate_local
 from PIL import Image
 
 import mi_prt
 from mi_prt.lighting.from_mitsuba import scene_light
 from mi_prt.lighting.to_mitsuba import lit_scene
 from mi_prt.output.film import light_path
-from mi_prt.output.relight_local import animate_local
 from mi_prt.render.display import display, exposure
 from mi_prt.render.image import render_image, resized
 from mi_prt.scene.scene import open_scene

@@ -7,9 +7,10 @@ import argparse
 import time
 from pathlib import Path
 
+from mi_prt.output.relight_local import animate_local
+
 import mi_prt
 from mi_prt.output.film import light_path
-from mi_prt.output.relight_local import animate_local
 
 SCENE = Path(__file__).resolve().parent.parent / "scenes" / "room.xml"
 # through the doorway

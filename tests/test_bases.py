@@ -8,16 +8,16 @@ import h5py
 import numpy as np
 import pytest
 from conftest import bias, cube, diffuse, disk, rectangle, relative_l2, scene, sky_of
+from mi_prt.basis.bases import BASES
+from mi_prt.precompute.info import describe, describe_asset
 
 import mi_prt
 from mi_prt import AssetError, SettingsError
-from mi_prt.basis.bases import BASES
 from mi_prt.directions import parse_directions
 from mi_prt.evaluate import ground_truth
 from mi_prt.lighting.cells import cell_radiance
 from mi_prt.lighting.lattice import on_lattice
 from mi_prt.lighting.to_mitsuba import lit_scene
-from mi_prt.precompute.info import describe, describe_asset
 from mi_prt.scene.scene import open_scene
 from mi_prt.transport.bits import sample_direct
 

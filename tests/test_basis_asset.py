@@ -7,6 +7,7 @@ import json
 import os
 import subprocess
 import sys
+from contextlib import suppress
 from types import SimpleNamespace
 
 import h5py
@@ -151,7 +152,7 @@ def test_encode_and_reconstruct_are_the_projection():
     matrix, weights = random_matrix(200, 80, 25), np.random.default_rng(1).random(80) + 0.2
     index = np.arange(0, 200, 2)
     basis = fit(matrix, weights, 10, index)
-    weighted, squares, vectors = svd(matrix[index], weights)
+    _, _, vectors = svd(matrix[index], weights)
     mean = matrix[index].mean(axis=0)
     projection = ((matrix - mean) * np.sqrt(weights) @ vectors[:10].T @ vectors[:10]) / np.sqrt(
         weights
@@ -280,7 +281,7 @@ def test_the_papers_mean_compensation_drops_the_mean_outside_of_the_span():
         np.float32
     )
     weights, radiance = rng.random(70) + 0.1, rng.random((70, 3)).astype(np.float32)
-    basis, exact, paper, direct = irradiances(matrix, weights, 5, radiance)
+    _, exact, paper, direct = irradiances(matrix, weights, 5, radiance)
     assert relative_l2(exact, direct) < 1e-5
     _, _, vectors = svd(matrix, weights)
     mean = matrix.mean(axis=0, dtype=np.float64) * np.sqrt(weights)
@@ -453,8 +454,11 @@ def test_the_same_seed_gives_the_same_file_within_a_process(kind, saved, tmp_pat
 PROGRAM = """
 import sys, mi_prt
 red = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.8, 0.3, 0.2]}}
-parts = {"type": "scene", "ball": {"type": "sphere", "center": [0, 1, 0], "bsdf": red}, "box": {"type": "cube"}, "extra": {"type": "disk"}}
-asset = mi_prt.precompute(parts, directions="cubemap:8", edge_length=0.5, indirect=sys.argv[2], paths_per_point=64)
+ball = {"type": "sphere", "center": [0, 1, 0], "bsdf": red}
+parts = {"type": "scene", "ball": ball, "box": {"type": "cube"}, "extra": {"type": "disk"}}
+asset = mi_prt.precompute(
+    parts, directions="cubemap:8", edge_length=0.5, indirect=sys.argv[2], paths_per_point=64
+)
 assert asset.channels == 3
 asset.save(sys.argv[1])
 """
@@ -497,10 +501,8 @@ def test_damaged_bytes_never_end_in_another_error(saved, tmp_path):
         for place in rng.integers(0, len(whole) if i % 3 == 0 else 3000, 3):
             damaged[place] = rng.integers(256)
         (tmp_path / "damaged.prt").write_bytes(damaged)
-        try:
+        with suppress(AssetError):
             mi_prt.load(tmp_path / "damaged.prt")
-        except AssetError:
-            pass
 
 
 def changed(saved, path, change):

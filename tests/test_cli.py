@@ -64,7 +64,7 @@ def test_precompute_prints_the_promised_keys_and_nothing_else_on_stdout(
     """Without an option it is light after as many reflections as it takes: in a box of albedos of
     about a half more than four.
     """
-    code, out, err = run(
+    code, out, _ = run(
         capsys, "precompute", scene, "-o", tmp_path / "a.prt", *FAST, *options, "--json"
     )
     result = json.loads(out)
@@ -97,14 +97,16 @@ def test_json_is_strict(tmp_path, capsys, bounces):
     """Between white walls there is no bound of what a few reflections leave out; and infinity is no
     JSON.
     """
-    wall = """<shape type='rectangle'><transform name='to_world'><translate z='-1'/><rotate {}/></transform>
+    wall = """<shape type='rectangle'>
+        <transform name='to_world'><translate z='-1'/><rotate {}/></transform>
         <bsdf type='diffuse'><rgb name='reflectance' value='1'/></bsdf></shape>"""
     walls = "".join(
         wall.format(f"{axis}='1' angle='{degrees}'")
         for axis, degrees in (("x", 0), ("x", 90), ("x", -90), ("y", 90), ("y", -90))
     )
     (tmp_path / "white.xml").write_text(
-        f"""<scene version='3.0.0'>{walls}<emitter type='constant'/><sensor type='perspective'><transform name='to_world'>
+        f"""<scene version='3.0.0'>{walls}<emitter type='constant'/>
+        <sensor type='perspective'><transform name='to_world'>
         <lookat origin='0.1,-0.3,3' target='0,0,0' up='0,0,1'/></transform></sensor></scene>"""
     )
 

@@ -424,10 +424,13 @@ def test_instances_flipped_and_coarse_shapes(bounces, indirect):
 XML = """<scene version="3.0.0">
     <integrator type="prt"><string name="filename" value="data/ball.prt"/></integrator>
     <sensor type="perspective"><float name="fov" value="35"/>
-        <transform name="to_world"><lookat origin="0, 2.5, 5" target="0, 0.3, 0" up="0, 1, 0"/></transform>
-        <film type="hdrfilm"><integer name="width" value="36"/><integer name="height" value="24"/><rfilter type="box"/></film>
+        <transform name="to_world">
+            <lookat origin="0, 2.5, 5" target="0, 0.3, 0" up="0, 1, 0"/></transform>
+        <film type="hdrfilm"><integer name="width" value="36"/>
+            <integer name="height" value="24"/><rfilter type="box"/></film>
     </sensor>
-    <shape type="rectangle"><transform name="to_world"><scale value="2"/><rotate x="1" angle="-90"/></transform>
+    <shape type="rectangle">
+        <transform name="to_world"><scale value="2"/><rotate x="1" angle="-90"/></transform>
         <bsdf type="diffuse"><rgb name="reflectance" value="0.7, 0.5, 0.3"/></bsdf></shape>
     <shape type="sphere"><point name="center" value="0, 0.5, 0"/><float name="radius" value="0.5"/>
         <bsdf type="diffuse"><rgb name="reflectance" value="0.3, 0.5, 0.8"/></bsdf></shape>

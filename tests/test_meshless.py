@@ -541,10 +541,7 @@ def test_spot_and_area_lights_against_mitsuba(room, opened_room, light, most):
     Direct light at all samples (11 to 14 % RMSE of the spot with its hard edges in 4 runs, 3 % and
     4 to 6 % of the others), reflected at 150.
     """
-    if light is None:
-        lit = opened_room.modelled(keep_local=True)
-    else:
-        lit = lit_scene(opened_room, as_light(light), modelled=True)
+    lit = lit_scene(opened_room, light, modelled=True)
     points, index = some(room.points, 150)
     rmse, found, noise = errors(
         room.irradiance(light, "direct"), point_irradiance(lit, room.points, 64)

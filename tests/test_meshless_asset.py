@@ -14,6 +14,8 @@ import h5py
 import numpy as np
 import pytest
 from conftest import cube, diffuse, rectangle, scene, uniform_sky
+from mi_prt.asset.meshless_file import as_stored, compressed
+from mi_prt.asset.quantize import LARGEST, cluster_scales, quantized, quantized_by_cluster
 
 import mi_prt
 from mi_prt import (
@@ -24,8 +26,6 @@ from mi_prt import (
     PointLight,
     SettingsError,
 )
-from mi_prt.asset.meshless_file import as_stored, compressed
-from mi_prt.asset.quantize import LARGEST, cluster_scales, quantized, quantized_by_cluster
 from mi_prt.lighting.local_emitters import local_scene_light
 from mi_prt.points.points import POINT_FIELDS
 from mi_prt.precompute.settings import MeshlessSettings

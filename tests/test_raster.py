@@ -14,6 +14,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from conftest import diffuse, disk, emitted, rectangle, scene, sky_of, sphere
+from mi_prt.points.interpolate import PatchInterpolator
 
 import mi_prt
 from mi_prt.errors import SceneError, SettingsError
@@ -421,7 +422,9 @@ PROGRAM = """
 import sys, numpy as np
 from test_raster import diffuse, linear, opened, rectangle, sphere
 scene, asset, sensor = opened(
-    floor=rectangle(bsdf=diffuse([0.2, 0.5, 0.8])), ball=sphere(radius=0.5, bsdf=diffuse()), sky={"type": "constant"}
+    floor=rectangle(bsdf=diffuse([0.2, 0.5, 0.8])),
+    ball=sphere(radius=0.5, bsdf=diffuse()),
+    sky={"type": "constant"},
 )
 np.save(sys.argv[1], linear(asset, scene, sensor, asset.irradiance(None)))
 """

@@ -8,16 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import bias, diffuse, relative_l2
+from mi_prt.output.export import to_8bit
+from mi_prt.output.relight_local import animate_local
 
 import mi_prt
 from mi_prt import LightError, SettingsError
 from mi_prt.cli import main
 from mi_prt.evaluate import ground_truth
 from mi_prt.lighting.to_mitsuba import lit_scene
-from mi_prt.output.export import to_8bit
 from mi_prt.output.film import light_path
 from mi_prt.output.relight import relight_to_file
-from mi_prt.output.relight_local import animate_local
 from mi_prt.scene.scene import open_scene
 from mi_prt.system.runtime import mitsuba
 
@@ -291,8 +291,7 @@ def test_distant_assets_refuse_components(tmp_path):
     distant = mi_prt.precompute(flat, directions="cubemap:4", coefficients=1)
     with pytest.raises(SettingsError, match="points='samples'"):
         relight_to_file(distant, tmp_path / "a.npz", component="indirect", scene=flat)
-    with pytest.raises(LightError, match="points='samples'"):
-        distant.irradiance(mi_prt.SpotLight((0, 1, 0), (0, -1, 0), 1.0))
+    assert distant.irradiance(mi_prt.SpotLight((0, 1, 0), (0, -1, 0), 1.0)).any()
 
 
 def test_films_without_a_light_to_move_are_refused(asset, tmp_path):

@@ -305,10 +305,12 @@ def test_too_many_coefficients_cost_no_rays(tmp_path):
 
 
 def test_a_workspace_belongs_to_one_process(tmp_path):
-    with durable(tmp_path / "a.prt", {}, False):
-        with pytest.raises(SettingsError, match="another process"):
-            with durable(tmp_path / "a.prt", {}, True):
-                pass
+    with (
+        durable(tmp_path / "a.prt", {}, False),
+        pytest.raises(SettingsError, match="another process"),
+        durable(tmp_path / "a.prt", {}, True),
+    ):
+        pass
     assert os.listdir(tmp_path) == []
 
 
@@ -317,9 +319,11 @@ def test_what_stands_in_the_way(tmp_path):
     run.
     """
     (tmp_path / "a.prt.partial").write_text("")
-    with pytest.raises(SettingsError, match="a.prt.partial"):
-        with durable(tmp_path / "a.prt", {}, False):
-            pass
+    with (
+        pytest.raises(SettingsError, match="a.prt.partial"),
+        durable(tmp_path / "a.prt", {}, False),
+    ):
+        pass
     (tmp_path / "b.prt.partial").mkdir()
     (tmp_path / "b.prt.partial" / "visibility.rows").write_bytes(b"old")
     with durable(tmp_path / "b.prt", {}, False) as workspace:
@@ -373,9 +377,11 @@ def test_a_folder_that_was_replaced_while_it_was_locked(tmp_path, monkeypatch):
     monkeypatch.setattr(fcntl, "flock", replaced)
     with durable(tmp_path / "a.prt", {}, False):
         monkeypatch.setattr(fcntl, "flock", flock)
-        with pytest.raises(SettingsError, match="another process"):
-            with durable(tmp_path / "a.prt", {}, True):
-                pass
+        with (
+            pytest.raises(SettingsError, match="another process"),
+            durable(tmp_path / "a.prt", {}, True),
+        ):
+            pass
     assert len(calls) == 2
 
 
@@ -602,7 +608,7 @@ def test_a_torn_end_is_dropped(rows, cut):
 
 
 def test_a_damaged_block_and_a_torn_journal_are_dropped(rows):
-    path, matrix = rows
+    path, _ = rows
     content = bytearray(path.read_bytes())
     content[25] ^= 1  # in the second block
     path.write_bytes(content)
@@ -674,7 +680,9 @@ from mi_prt.scene.scene import open_scene
 from test_resume import RUNS, SCENE
 pca.NEGLIGIBLE = 0
 settings = RUNS[sys.argv[3]]
-mi_prt.precompute(SCENE, **settings | dict(directions="cubemap:2", edge_length=1, coefficients=4))  # what Mitsuba and Embree take once
+# what Mitsuba and Embree take once
+small = dict(directions="cubemap:2", edge_length=1, coefficients=4)
+mi_prt.precompute(SCENE, **settings | small)
 limit = resident_bytes() + 60_000_000
 def blocks(**options):
     stages = []

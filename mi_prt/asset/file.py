@@ -3,6 +3,7 @@ field.
 """
 
 from pathlib import Path
+from typing import Any
 
 from ..errors import AssetError, SettingsError
 from ..points.layout import LAYOUTS
@@ -69,7 +70,7 @@ def write(asset, path, folder=None):
     container.write(path, header, arrays, folder)
 
 
-def read(path):
+def read(path) -> dict[str, Any]:
     """Read an asset.
 
     Parameters

@@ -4,6 +4,8 @@ from abc import ABC, abstractmethod
 from math import inf
 from typing import ClassVar
 
+import numpy as np
+
 from ..lighting.cells import cell_radiance
 from ..lighting.lattice import on_lattice
 from ..system.parallel import one_blas_thread
@@ -80,7 +82,7 @@ class Basis(ABC):
         """
 
     @abstractmethod
-    def project_light(self, radiance):
+    def project_light(self, radiance) -> tuple[np.ndarray, np.ndarray]:
         """Light (d, 3) float32 in the basis, and the response of the mean (3,), from the radiance
         of cells (s, 3).
         """

@@ -16,6 +16,7 @@ weight is an orthonormal coefficient; with aᵢ = √wᵢ tᵢ these are (√w�
 from dataclasses import dataclass
 from functools import cache, cached_property
 from math import inf, log2, sqrt
+from typing import cast
 
 import numpy as np
 import scipy.sparse
@@ -401,11 +402,11 @@ def fit_haar_shared(
     components, residual = _fewest(target, energies[order], variance)
     s = len(energies)
     check_room(f"a basis of {components:,} wavelets", FIT_BYTES * components * s, max_bytes)
-    chosen = order[:components]
+    chosen, lattice = order[:components], cast(Cubemap, rows.directions)
     vectors = np.zeros((components, s), np.float32)
     vectors[np.arange(components), chosen] = 1
     basis = SharedHaarBasis(
-        haar_transform(rows.directions.resolution).inverse(vectors) * rows.sqrt_weights,
+        haar_transform(lattice.resolution).inverse(vectors) * rows.sqrt_weights,
         np.zeros(s, np.float32),
         rows.sqrt_weights,
         shares(energies[chosen], variance),

@@ -5,6 +5,7 @@ that they make.
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import inf, isqrt, pi, sqrt
+from typing import Any
 
 import numpy as np
 import scipy.linalg
@@ -236,7 +237,7 @@ class HarmonicMap(DistantPart):
     rotation : (3, 3) float64
     """
 
-    environment: object
+    environment: Any
     functions: tuple
     coefficients: np.ndarray
     rotation: np.ndarray = field(default_factory=lambda: np.eye(3))

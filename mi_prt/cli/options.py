@@ -42,8 +42,8 @@ Lights = Annotated[
     typer.Option(
         "--light",
         metavar="SPEC",
-        help=f"{forms()}. One number is grey; W/sr, W/m², W/(m² sr), degrees. May be repeated: lights"
-        " add up, also to --envmap.",
+        help=f"{forms()}. One number is grey; W/sr, W/m², W/(m² sr), degrees. May be repeated:"
+        " lights add up, also to --envmap.",
     ),
 ]
 Component = Annotated[
@@ -97,7 +97,7 @@ def with_settings(command):
         given = {name: value for name, value in settings.items() if value is not None}
         return command(settings=given, **arguments)
 
-    run.__signature__ = signature.replace(parameters=parameters)
+    run.__signature__ = signature.replace(parameters=parameters)  # pyright: ignore[reportAttributeAccessIssue]
     run.__annotations__ = {p.name: p.annotation for p in parameters}
     return run
 

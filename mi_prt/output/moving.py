@@ -2,6 +2,7 @@
 
 import time
 from dataclasses import dataclass, field
+from typing import Any
 
 from ..asset.provenance import open_scene_of
 from ..errors import LightError
@@ -98,7 +99,7 @@ class _Film:
 
     picture: Picture
     moving: _Moving
-    progress: object
+    progress: Any
     frames: int
     done: int = 0
     factor: float | None = None

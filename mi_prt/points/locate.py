@@ -107,6 +107,9 @@ class PatchLocator(Locator):
                 else faces.take(surface)
             )
             missing = int((patch == NO_PATCH).sum())
+            if missing == len(patch) and surface.shape.is_emitter():
+                starts.append(NO_PATCH)  # a light that was added: it reflects nothing
+                continue
             if missing:
                 raise SceneError(
                     f"shape '{surface.name}' has {missing} faces that the asset does not know: "

@@ -88,7 +88,7 @@ def _areas(scene, hits, radius, seed):
     low, high = hits.positions.min(axis=0), hits.positions.max(axis=0)
     ball = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2 * 1.01, radius)
     counts, near, blocks = np.zeros(len(hits), np.int64), 0, 0
-    for crossings, area in cross_surfaces(scene, *ball, seed):
+    for crossings, area in cross_surfaces(scene, *ball, seed):  # noqa: B007  (the last area)
         blocks += 1
         if len(crossings):
             index, distance = locator.nearest(

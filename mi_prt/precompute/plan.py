@@ -1,6 +1,7 @@
 """What a scene calls for: which points, and which transports, each with its reason."""
 
 from dataclasses import dataclass
+from typing import Any
 
 from ..errors import SettingsError
 from .job import BUILDERS
@@ -19,7 +20,7 @@ class Plan:
         Why, by the name of the setting.
     """
 
-    settings: object
+    settings: Any
     reasons: dict
 
     @property

@@ -6,6 +6,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -35,7 +36,7 @@ class SceneSource:
     kind: str
     path: str | None = None
     parameters: dict = field(default_factory=dict)
-    content: object = field(default=None, repr=False, compare=False)
+    content: Any = field(default=None, repr=False, compare=False)
 
 
 class Scene:

@@ -29,7 +29,7 @@ class Registry(Mapping):
         Raised for an unknown name, an `InputError`.
     """
 
-    def __init__(self, what, package, error=SettingsError):
+    def __init__(self, what, package, error: type[Exception] = SettingsError):
         self._what, self._package, self._error = what, package, error
         self._kinds, self._complete = {}, False
 
@@ -48,6 +48,10 @@ class Registry(Mapping):
             return entry
 
         return register
+
+    def restore(self, kinds):
+        """Hold these kinds, a dict by name, and no others; for tests of what is registered."""
+        self._kinds = dict(kinds)
 
     def __getitem__(self, name):
         """The kind of a name.

@@ -295,7 +295,7 @@ def pyrender() -> ModuleType:
     raster_platform()
     if "pyrender" not in sys.modules:
         viewer = ModuleType("pyrender.viewer")
-        viewer.Viewer = None
+        viewer.Viewer = None  # pyright: ignore[reportAttributeAccessIssue]
         sys.modules["pyrender.viewer"] = viewer
     return importlib.import_module("pyrender")
 

@@ -1,6 +1,7 @@
 """Transport of distant light: a basis, and the coefficients of all points (Eigentransport)."""
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -32,7 +33,7 @@ class DistantTransport(Transport):
         by reflections.
     """
 
-    directions: object
+    directions: Any
     total: Compressed
     direct: Compressed | None
     report: dict = field(default_factory=dict)

@@ -160,7 +160,7 @@ class LampRays:
 
         mi = mitsuba()
         index = met[0]
-        lane = dr.arange(mi.UInt32, self._aimed * 2 * size)
+        lane = dr.arange(mi.UInt32, self._aimed * 2 * size)  # pyright: ignore[reportOptionalOperand]
         size_ = dr.opaque(mi.UInt32, size)
         k, slots = dr.opaque(mi.UInt32, self._k), dr.opaque(mi.UInt32, self._aimed)
         column = lane // size_  # half by half, slot by slot
@@ -189,7 +189,7 @@ class LampRays:
 
         dr.while_loop((column & 1,), lambda number: number < rays, add)
         dr.eval(sums)
-        sums = np.array(sums).reshape(self._aimed, 2, size, self._k, 3)
+        sums = np.array(sums).reshape(self._aimed, 2, size, self._k, 3)  # pyright: ignore[reportArgumentType]
         return sums.sum(axis=0).transpose(0, 3, 1, 2)
 
     def _lamp_at(self, row, draw):

@@ -1,5 +1,8 @@
 """Direct light of a scene's own lamps at its points, by shadow rays over the whole of each lamp."""
 
+# Mitsuba's stubs know nothing of what a pointer to an emitter or a register array can do.
+# pyright: reportAttributeAccessIssue=false, reportIndexIssue=false
+
 from dataclasses import dataclass
 
 import numpy as np

@@ -128,7 +128,7 @@ class LocalTransport(Transport):
             "quantize": self.quantize,
             "extent": float(self.depth.extent),
             "reflects": self.reflects,
-            "channels": self.transfer.matrix.shape[3] if self.reflects else 1,
+            "channels": self.transfer.matrix.shape[3] if self.reflects else 1,  # pyright: ignore[reportOptionalMemberAccess]
             "sparse": "transfer/columns" in self.arrays(),
             "report": self.report,
         }

@@ -186,4 +186,4 @@ class OwnTransport(Transport):
             columns.append(
                 values * arrays[f"{name}_scale"] if f"{name}_scale" in arrays else values
             )
-        return cls(tuple(header["lamps"]), *columns, header["quantize"], header["report"])
+        return cls(tuple(header["lamps"]), *columns, header["quantize"], header["report"])  # pyright: ignore[reportCallIssue]

@@ -5,7 +5,7 @@ A transport answers one question: what do the points receive under this light, o
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from ..errors import SettingsError
 from ..system.registry import Registry
@@ -34,7 +34,7 @@ class Question:
         If the component is another.
     """
 
-    light: object
+    light: Any
     component: str = "total"
     nearest: int = 1
 
