@@ -53,9 +53,10 @@ def relight(asset):
 
     lights = [asset.own_lights[name] for name in getattr(asset.transports.get("own"), "names", ())]
     if "distant" in asset.transports:
-        sky = np.ones((2, 4, 3), np.float32)
-        asset.irradiance(asset.prepare_light(sky).rotated("y", 30))
-        lights.append(sky)
+        lights.append(mi_prt.DirectionalLight((1, -1, 0.3), 2))
+        if asset.transports["distant"].basis.kind == "sh":  # maps turn in closed form
+            sky = asset.prepare_light(np.ones((2, 4, 3), np.float32))
+            asset.irradiance(sky.rotated("y", 30))
     if asset.transports.keys() & {"distant", "local"}:
         lights.append(mi_prt.PointLight((0.3, 1, 0.4), 2))
     with np.errstate(all="ignore"):

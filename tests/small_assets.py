@@ -28,7 +28,13 @@ KINDS = {
     "none": {"basis": "none", "bounces": 0, **DISTANT},
     "haar-shared": {"basis": "haar-shared", "coefficients": 8, "keep_direct": True, **DISTANT},
     "own": {"transports": "own", "lamp_rays": 16, **VERTICES},
-    "dense": {"transfer_coefficients": 1, "transfer_error": 0, "cluster_size": 60, **LOCAL, **VERTICES},
+    "dense": {
+        "transfer_coefficients": 1,
+        "transfer_error": 0,
+        "cluster_size": 60,
+        **LOCAL,
+        **VERTICES,
+    },
     "sparse": {"transfer_error": 0.3, "cluster_size": 60, **LOCAL, **VERTICES},
     "samples": {"points": "samples", "count": 40, "cluster_size": 20, **LOCAL},
     "all": {

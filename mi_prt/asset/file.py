@@ -39,9 +39,7 @@ _SCENE = Record(
         "left_out": ListOf(_LEFT_OUT),
     }
 )
-_SETTINGS = Record(
-    {"bounces": OneOf(Nothing(), BOUNCES), "points": Text()}, others=Anything()
-)
+_SETTINGS = Record({"bounces": OneOf(Nothing(), BOUNCES), "points": Text()}, others=Anything())
 _HEADER = Record(
     {
         "scene": _SCENE,

@@ -173,7 +173,9 @@ def _checked_place(path):
     """A recorded path, if it leads to a regular file of this machine; else SceneError."""
     shown = ascii(path)[1:-1][:200]
     if path.startswith(_NETWORK):
-        raise SceneError(f"the asset's scene '{shown}' is no file of this machine: pass it (--scene)")
+        raise SceneError(
+            f"the asset's scene '{shown}' is no file of this machine: pass it (--scene)"
+        )
     try:
         mode = os.stat(path).st_mode
         is_file = stat.S_ISREG(mode) and not os.path.realpath(path).startswith(_SYSTEM)
@@ -182,5 +184,7 @@ def _checked_place(path):
             f"the asset's scene '{shown}' is not there any more: pass its new path (--scene)"
         ) from None
     if not is_file:
-        raise SceneError(f"the asset's scene '{shown}' is no regular file: pass the scene (--scene)")
+        raise SceneError(
+            f"the asset's scene '{shown}' is no regular file: pass the scene (--scene)"
+        )
     return path
