@@ -178,6 +178,12 @@ class Basis(ABC):
             Colour channels of the transport.
         """
 
+    def check_stored(self, directions):
+        """Raise ValueError unless its arrays, of a file, are those of a basis on a lattice."""
+        weights = self.sqrt_weights
+        if len(weights) != len(directions):
+            raise ValueError(f"a basis of {len(weights)} directions on {directions}")
+
     @classmethod
     def coefficient_shapes(cls, channels):
         """What the arrays of `pack` must be, {name: Array}, for n points."""

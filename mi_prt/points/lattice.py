@@ -13,7 +13,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from ..system.schema import Array, Flag, Number, Record, Text, check
+from ..system.schema import Array, Flag, Number, Record, Text
 from .layout import LAYOUTS, Layout
 
 MAX_LEVEL = 1 << 15
@@ -62,6 +62,8 @@ class Patches(Layout):
         "back": Array("i4", ("patches",), least=0, below="n"),
     }
 
+    SURFACE: ClassVar[Record] = _SURFACE
+
     def locator(self, scene, points):
         """See `Layout.locator`."""
         from .locate import PatchLocator
@@ -95,7 +97,6 @@ class Patches(Layout):
             raise ValueError("layout/back leads beyond the points")
         first = 0
         for surface in points.surfaces:
-            check(surface, _SURFACE, "points.surfaces")
             if surface["first_patch"] != first:
                 raise ValueError("points.surfaces do not list the patches in order")
             first += surface["patches"]

@@ -29,6 +29,8 @@ class SceneSource:
         Absolute path of a file.
     parameters : dict
         Values for the file's `<default>` parameters.
+    is_relative : bool
+        Whether the path was given relative to the working directory.
     content : dict or mi.Scene or None
         The dict or scene itself; not written to assets.
     """
@@ -36,6 +38,7 @@ class SceneSource:
     kind: str
     path: str | None = None
     parameters: dict = field(default_factory=dict)
+    is_relative: bool = False
     content: Any = field(default=None, repr=False, compare=False)
 
 
@@ -215,7 +218,7 @@ def open_scene(source, parameters=None):
     if not path.is_file():
         raise SceneError(f"scene '{path}' does not exist")
     loaded = _loaded(f"scene '{path}'", mi.load_file, str(path), **parameters)
-    return Scene(loaded, SceneSource("file", str(path), parameters))
+    return Scene(loaded, SceneSource("file", str(path), parameters, not Path(source).is_absolute()))
 
 
 def _loaded(what, load, *arguments, **parameters):
