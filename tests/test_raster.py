@@ -359,9 +359,9 @@ def test_buried_points_give_their_share_to_the_others():
         floor=rectangle(size=1, bsdf=diffuse(1.0)),
         sky={"type": "constant"},
     )
-    reference = render_image(
-        asset, scene_lit.mi_scene, sensor_lit, spp=4, irradiance=irradiance
-    )[..., 0]
+    reference = render_image(asset, scene_lit.mi_scene, sensor_lit, spp=4, irradiance=irradiance)[
+        ..., 0
+    ]
     assert np.abs(seen - reference).mean() < 0.01
 
 

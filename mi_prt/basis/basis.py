@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from math import inf
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -55,6 +55,7 @@ class Basis(ABC):
     holds_reflections: ClassVar[bool] = True
     joins_channels: ClassVar[bool] = False
     work: ClassVar[tuple] = (1, 1)
+    sqrt_weights: Any
     copies: ClassVar[float] = 2.0
 
     # --- from light to irradiance -------------------------------------------------------------

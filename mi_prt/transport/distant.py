@@ -190,8 +190,8 @@ class DistantTransport(Transport):
         report = report_spec(
             ("captured_variance", "relative_error"), ("indirect_noise", "bounce_energy_left")
         )
-        report.fields["rays_per_direction"] = Number(1, 1 << 20, whole=True)
-        report.fields["bounce_energy"] = ListOf(Number(-1e30, 1e30))
+        rays = {"rays_per_direction": Number(1, 1 << 20, whole=True)}
+        report.fields = report.fields | rays | {"bounce_energy": ListOf(Number(-1e30, 1e30))}
         fields = {"directions": Text(), "basis": Text(), "keeps_direct": Flag(), "report": report}
         return Record(fields)
 

@@ -55,11 +55,11 @@ class LampRays:
         self._direct = mi.Float(np.ascontiguousarray(direct, np.float32).ravel())
         self._offset = dr.opaque(mi.Float, RAY_OFFSET * scene.scale)
         self._seed = dr.opaque(mi.UInt32, seed % (1 << 32))
-        self._aimed = aimed if self._k > aimed else None
-        if self._aimed is not None:
+        self._aimed = aimed if self._k > aimed else 0  # 0: all of them
+        if self._aimed:
             self._chances = mi.Float(_chances(direct).ravel())
         # of one wavefront each: rays, and the sums of lamps
-        widest = max(rays, 2 * self._k if self._aimed is None else 6 * self._k * aimed)
+        widest = max(rays, 6 * self._k * aimed if self._aimed else 2 * self._k)
         self._step = max(1, lanes // widest)
 
     def blocks(self, kept):
@@ -134,7 +134,7 @@ class LampRays:
         """Irradiance (2, 3, b, k) after one reflection, by either half of the rays."""
         sums = (
             self._of_each(met, first, size)
-            if self._aimed is None
+            if not self._aimed
             else self._of_chosen(met, first, size)
         )
         return sums * np.float32(2 / self._rays)

@@ -1,5 +1,8 @@
 """Local emitters of a scene by number, in Dr.Jit."""
 
+# Mitsuba's stubs know nothing of what a pointer to an emitter or a register array can do.
+# pyright: reportAttributeAccessIssue=false, reportIndexIssue=false
+
 import numpy as np
 
 from ..errors import LightError
