@@ -12,8 +12,8 @@ from PIL import Image
 
 from mi_prt.errors import SettingsError
 from mi_prt.output import npz, ply
-from mi_prt.render import image_file
 from mi_prt.points.points import sample_points
+from mi_prt.render import image_file
 from mi_prt.render.display import display, exposure
 from mi_prt.scene.scene import open_scene
 from mi_prt.system.runtime import mitsuba

@@ -190,8 +190,11 @@ class DistantTransport(Transport):
         report = report_spec(
             ("captured_variance", "relative_error"), ("indirect_noise", "bounce_energy_left")
         )
-        rays = {"rays_per_direction": Number(1, 1 << 20, whole=True)}
-        report.fields = report.fields | rays | {"bounce_energy": ListOf(Number(-1e30, 1e30))}
+        more = {
+            "rays_per_direction": Number(1, 1 << 20, whole=True),
+            "bounce_energy": ListOf(Number(-1e30, 1e30)),
+        }
+        report = Record({**report.fields, **more}, report.optional, report.others)
         fields = {"directions": Text(), "basis": Text(), "keeps_direct": Flag(), "report": report}
         return Record(fields)
 
