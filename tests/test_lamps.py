@@ -9,6 +9,7 @@ from mi_prt.evaluate import ground_truth
 from mi_prt.points.locate import PatchLocator
 from mi_prt.points.points import sample_points
 from mi_prt.points.samples import scatter_samples
+from mi_prt.precompute.workspace import RowFile
 from mi_prt.scene.materials import facing as side_of
 from mi_prt.scene.scene import open_scene
 from mi_prt.system.runtime import count_kernels, mitsuba
@@ -504,6 +505,30 @@ def test_results_do_not_depend_on_wavefronts(room, aimed):
     narrow = room.reflected(direct, seed=3, lanes=1 << 14, **options).irradiance
     assert np.array_equal(result, narrow)
     assert not np.array_equal(result, room.reflected(direct, seed=4, **options).irradiance)
+
+
+def test_rays_in_a_file_give_the_same(room, tmp_path):
+    """Rays kept in a file are those kept in memory."""
+    direct = room.direct()
+    stored = room.reflected(
+        direct,
+        rays=16,
+        lanes=1 << 14,
+        hop_rows=lambda count, size: RowFile(tmp_path / "hops", count, size),
+    )
+    assert np.array_equal(stored.irradiance, room.reflected(direct, rays=16).irradiance)
+    assert (tmp_path / "hops").stat().st_size == len(room.points) * 16 * 16
+
+
+def test_nearly_white_surfaces_are_solved_for():
+    """Albedo 0.95, above which a bound by albedo says little: E₀·ρ/(1 − ρ), 19 times the direct
+    light, by a Krylov method. Footprints take away 1e-3 at most.
+    """
+    globe = sphere(radius=2.0, flip_normals=True, bsdf=diffuse(0.95))
+    lit = Lit(scene(globe=globe, bulb=light_bulb((0, 0, 0), 3)), 0.5)
+    result = lit.reflected(rays=64)
+    assert np.allclose(result.irradiance, 0.75 * 19, rtol=3e-3)
+    assert result.bounces == (None, None)
 
 
 def test_kernels_are_shared(room):

@@ -122,7 +122,7 @@ def reflected_light(
         scene, points, Lamps(scene, emitters), direct, locator, rays, aimed, seed, lanes
     )
     kept = min(HOP_RAYS, rays)
-    store = _InMemory(n, kept * HOP.itemsize) if hop_rows is None else hop_rows(n, kept)
+    store = (_InMemory if hop_rows is None else hop_rows)(n, kept * HOP.itemsize)
     gather = np.empty((2, 3, n, k), np.float32)
     for block, hops, gathered in sampler.blocks(kept):
         store.append(hops)
