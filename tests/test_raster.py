@@ -14,7 +14,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from conftest import diffuse, disk, emitted, rectangle, scene, sky_of, sphere
-from mi_prt.points.interpolate import PatchInterpolator
 
 import mi_prt
 from mi_prt.errors import SceneError, SettingsError

@@ -1,6 +1,7 @@
 """Options of the command line; those of a precomputation are made from its settings."""
 
 import inspect
+import re
 from functools import wraps
 from pathlib import Path
 from typing import Annotated
@@ -8,7 +9,7 @@ from typing import Annotated
 import typer
 
 from ..errors import SettingsError
-from ..lighting.parse import forms
+from ..lighting.part import LIGHTS
 from ..precompute.options import Flag
 from ..precompute.settings import OPTIONS
 
@@ -20,6 +21,12 @@ _PANELS = {
     "own": "Transport: the scene's own lamps",
     "local": "Transport: lamps that move",
 }
+
+
+def _unmarked(text):
+    """Text in which a bracket before a letter is no markup."""
+    return re.sub(r"\[(?=[a-z])", r"\\[", text)
+
 
 Json = Annotated[
     bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else.")
@@ -42,8 +49,7 @@ Lights = Annotated[
     typer.Option(
         "--light",
         metavar="SPEC",
-        help=f"{forms()}. One number is grey; W/sr, W/m², W/(m² sr), degrees. May be repeated:"
-        " lights add up, also to --envmap.",
+        help="A light, see below. May be repeated: lights add up, also to --envmap.",
     ),
 ]
 Component = Annotated[
@@ -81,6 +87,22 @@ Size = Annotated[
 ]
 Seed = Annotated[int, typer.Option("--seed", help="Same seed, same result.")]
 
+LIGHTS_HELP = "\n\n".join(
+    [
+        "Lights:",
+        *(_unmarked(LIGHTS[kind].FORM) for kind in sorted(LIGHTS)),
+        "Each with a factor if need be: *0.3 or *r,g,b. In the place of r,g,b one number is grey.",
+        "",
+    ]
+)
+
+
+def flowing(command):
+    """A command whose help has no line breaks but those between paragraphs."""
+    paragraphs = inspect.cleandoc(command.__doc__).split("\n\n")
+    command.__doc__ = "\n\n".join(" ".join(paragraph.split()) for paragraph in paragraphs)
+    return command
+
 
 def with_settings(command):
     """A command whose parameter `settings` is a dict of the settings that the user gave; each is an
@@ -106,7 +128,7 @@ def _parameter(option):
     """A keyword parameter for Typer; None where the user does not give it."""
     flag = "--" + option.name.replace("_", "-")
     default = "" if option.default in (None, False) else f" [{_shown(option.default)}]"
-    rest = {"help": option.help + default, "rich_help_panel": _PANELS[option.group]}
+    rest = {"help": _unmarked(option.help + default), "rich_help_panel": _PANELS[option.group]}
     if isinstance(option, Flag):
         kind = typer.Option(f"{flag}/--no-{flag[2:]}", show_default=False, **rest)
         annotation = Annotated[bool | None, kind]
