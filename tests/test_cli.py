@@ -1,6 +1,7 @@
 """The command line: exact JSON keys, exit codes, one-line errors, files written."""
 
 import json
+import os
 import shutil
 import signal
 import subprocess
@@ -336,7 +337,32 @@ def test_same_seed_same_file(scene, tmp_path, capsys):
         (("relight", "{old}", "-o", "{folder}/x.png"), "older version of mi_prt"),
         (("relight", "{truncated}", "-o", "{folder}/x.png"), "truncated"),
         (("relight", "{foreign}", "-o", "{folder}/x.png"), "no mi_prt asset"),
-        (("relight", "{asset}", "-o", "{folder}/x.jpg"), ".exr, .png, .ply, .npz"),
+        (("relight", "{asset}", "-o", "{folder}/x.jpg"), ".exr, .png, .npz, .ply"),
+        (("relight", "{folder}", "-o", "{folder}/x.png"), "is a folder"),
+        (("compare", "{fifo}", "-o", "{folder}/c"), "is a fifo"),
+        (("info", "{fifo}"), "is no regular file"),
+        (("info", "{folder}"), "is a folder"),
+        (("info", "{old}"), "older version of mi_prt"),
+        (("precompute", "{folder}", "-o", "{folder}/x.prt"), "is a folder"),
+        (("precompute", "{scene}", "-o", "{folder}/x.prt", "--lamp-rays", "8"), "transport own"),
+        (("precompute", "{scene}", "-o", "{folder}/x.prt", "--transports", "own"), "no lamps"),
+        (("precompute", "{scene}", "-o", "{folder}/x.prt", "--transports", "sky"), "own, local"),
+        (
+            ("info", "{scene}", "--points", "samples", "--edge-length", "1"),
+            "points vertices, and these are samples",
+        ),
+        (("relight", "{asset}", "-o", "{folder}/x.png", "--light", "scene:nobody"), "it has sky_1"),
+        (("compare", "{asset}", "-o", "{folder}/c", "--light", "scene:nobody"), "it has sky_1"),
+        (("relight", "{asset}", "-o", "{folder}/x.npz", "--light", "scene*x"), "not of the form"),
+        (("relight", "{asset}", "-o", "{folder}/x.npz", "--light", "sun:1"), "no known kind"),
+        (("relight", "{asset}", "-o", "{folder}/x.npz", "--component", "direct"), "--keep-direct"),
+        (("relight", "{asset}", "-o", "{folder}/x.npz", "--nearest", "0"), "at least 1"),
+        (("relight", "{asset}", "-o", "{folder}/x.png", "--spp", "0"), "spp must be 1…"),
+        (("relight", "{asset}", "-o", "{folder}/x.png", "--frames", "3"), "--light-path"),
+        (
+            ("relight", "{asset}", "-o", "{folder}/x.gif", "--light-path", "0,0,0 1,0,0"),
+            "moves the first point, spot or area light",
+        ),
         (("relight", "{asset}", "-o", "{folder}/x.png", "--sensor", "7"), "sensors 0…0"),
         (("relight", "{asset}", "-o", "{folder}/x.png", "--size", "0x4"), "at least 1x1"),
         (("relight", "{asset}", "-o", "{folder}/x.png", "--size", "big"), "WxH"),
@@ -395,6 +421,7 @@ def bad_inputs(scene, asset, tmp_path_factory):
     OpenEXR.File({}, {"R": pixels[..., 0], "G": pixels[..., 0]}).write(
         str(folder / "red_green.exr")
     )
+    os.mkfifo(folder / "fifo")
     return {path.stem: path for path in folder.iterdir()} | {
         "scene": scene,
         "asset": asset,

@@ -270,6 +270,10 @@ def test_film_moves_the_lamp_of_an_area_light(asset, tmp_path):
 @pytest.mark.parametrize(
     "arguments, error",
     [
+        ({"rotate": ("y", 30)}, SettingsError),
+        ({"nearest": 0}, SettingsError),
+        ({"spp": 0}, SettingsError),
+        ({"spp": 1 << 22}, SettingsError),
         ({"component": "glossy"}, SettingsError),
         ({"direct": "somewhere"}, SettingsError),
         ({"renderer": "raster", "direct": "pixels"}, SettingsError),
@@ -283,9 +287,9 @@ def test_what_such_assets_do_not_take_is_refused(asset, tmp_path, arguments, err
     assert not (tmp_path / "a.exr").exists()
 
 
-def test_turning_leaves_local_light_as_it_is(asset, tmp_path):
-    """Only distant light turns; nearest directions stand in only where no transport is there."""
-    relight_to_file(asset, tmp_path / "a.npz", LIGHT, rotate=("y", 30), nearest=4)
+def test_nearest_directions_stand_in_only_where_no_transport_is(asset, tmp_path):
+    """Transport of local light is there: their number changes nothing."""
+    relight_to_file(asset, tmp_path / "a.npz", LIGHT, nearest=4)
     np.testing.assert_array_equal(
         np.load(tmp_path / "a.npz")["irradiance"], asset.irradiance(LIGHT)
     )

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import LightError
+from ..errors import LightError, SettingsError
 from ..lighting.environment import LightWarning
 from ..lighting.light import Light
 from ..lighting.own_light import SceneLight, resolve
@@ -80,13 +80,22 @@ class Asset:
             If the scene has no light of a name, or none at all.
         SceneError
             If the scene is needed and not to be had.
+        SettingsError
+            If there is no distant light to turn.
         """
         if light is None:
             light = self._own_light()
         names = {emitter["name"]: emitter["distant"] for emitter in self.emitters}
         opened = scene if scene_is_open(scene) else lambda: open_scene_of(self, scene)
         light = resolve(light, opened, names)
-        return light if rotate is None else light.rotated(*rotate)
+        if rotate is None:
+            return light
+        if light.distant.is_empty:
+            raise SettingsError(
+                "a rotation turns distant light, and there is none in this light: leave it out"
+                " (--rotate)"
+            )
+        return light.rotated(*rotate)
 
     def _own_light(self):
         """The scene's own light, as far as the asset holds it."""
@@ -175,7 +184,7 @@ class Asset:
                 held = "; ".join(f"{k} ({t.takes_words})" for k, t in self.transports.items())
                 wanted = [k for k, t in TRANSPORTS.items() if t.is_for(part)]
                 raise LightError(
-                    f"{part.words} is light that this asset holds no transport for; it holds"
+                    f"this asset holds no transport for this light ({part.words}); it holds"
                     f" {held}: precompute the scene again with transports"
                     f" {','.join([*self.transports, *wanted])} (--transports)"
                 )
@@ -232,7 +241,7 @@ class Asset:
 
     def answered(self, shares, component="total", nearest=1):
         """Irradiance (n, 3) float32 under light shared out, without warnings; see `irradiance`."""
-        Question(Light(()), component)
+        Question(Light(()), component, nearest)
         total = np.zeros((len(self.points), 3), np.float32)
         for kind, light in shares.items():
             question = Question(light, component, nearest)

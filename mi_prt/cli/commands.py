@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from ..errors import PrtError
+from ..errors import PrtError, SettingsError
 from . import options as take
 from .options import (
     LIGHTS_HELP,
@@ -16,6 +16,8 @@ from .options import (
     Define,
     Direct,
     Environment,
+    Frames,
+    FramesPerSecond,
     Json,
     Lights,
     Nearest,
@@ -197,8 +199,8 @@ def relight(
             help="Move the first --light along these places; OUT is a film.",
         ),
     ] = None,
-    frames: Annotated[int, typer.Option("--frames", metavar="N", help="Of the film.")] = 48,
-    fps: Annotated[int, typer.Option("--fps", help="Frames of the film in a second.")] = 25,
+    frames: Frames = None,
+    fps: FramesPerSecond = None,
     scene: OtherScene = None,
     threads: Threads = None,
     as_json: Json = False,
@@ -224,10 +226,13 @@ def relight(
         "direct": direct,
         "rotate": turned,
     }
+    film = {k: v for k, v in (("frames", frames), ("fps", fps)) if v is not None}
     if light_path is not None:
         path = path_of(light_path)
         with progress_bar() as progress:
-            result = animate(asset, output, path, frames, fps, chosen, progress=progress, **shown)
+            result = animate(asset, output, path, light=chosen, progress=progress, **film, **shown)
+    elif film:
+        raise SettingsError("--frames and --fps are of a film: give --light-path as well")
     else:
         result = relight_to_file(asset, output, chosen, nearest=nearest, **shown)
     _show(result if as_json else {"wrote": str(output)} | result, as_json)

@@ -10,6 +10,7 @@ import typer
 
 from ..errors import SettingsError
 from ..lighting.part import LIGHTS
+from ..output.film import FPS, FRAMES
 from ..precompute.options import Flag
 from ..precompute.settings import OPTIONS
 
@@ -84,6 +85,12 @@ OtherScene = Annotated[
 Sensor = Annotated[int, typer.Option("--sensor", help="Index of the scene's sensor.")]
 Size = Annotated[
     str | None, typer.Option("--size", metavar="WxH", help="Image size; default: the sensor's.")
+]
+Frames = Annotated[
+    int | None, typer.Option("--frames", metavar="N", help=f"Of the film [{FRAMES}].")
+]
+FramesPerSecond = Annotated[
+    int | None, typer.Option("--fps", metavar="N", help=f"Frames of the film in a second [{FPS}].")
 ]
 Seed = Annotated[int, typer.Option("--seed", help="Same seed, same result.")]
 
