@@ -324,9 +324,9 @@ def cornell(assets, pictures):
     shown = np.concatenate([display(x, factor) for x in (direct, ours, truth)], axis=1)
     Image.fromarray((shown * 255 + 0.5).astype("uint8")).save(pictures / "cornell.png")
     yield (
-        f"Left: direct light alone. Middle: mi_prt, 256 coefficients, {_distant(asset).report['bounces']}"
-        f" reflections (`auto`), precomputed in {sum(cost['seconds'].values()):.0f} s and relit in"
-        " milliseconds. Right: Mitsuba's `path` without a limit of depth, 2,048 samples per pixel."
+        "Left: direct light alone. Middle: mi_prt, 256 coefficients,"
+        f" {_distant(asset).report['bounces']} reflections (`auto`), precomputed in"
+        f" {sum(cost['seconds'].values()):.0f} s and relit in milliseconds. Right: Mitsuba's `path` without a limit of depth, 2,048 samples per pixel."
         f" Relative RMSE {metrics.relative_rmse(ours, truth):.1%}, bias"
         f" {metrics.relative_bias(ours, truth):+.2%} (of direct light alone"
         f" {metrics.relative_rmse(direct, truth):.0%} and"

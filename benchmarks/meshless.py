@@ -371,8 +371,9 @@ def speed(assets, pictures):
         size = file.stat().st_size
         loaded = mi_prt.load(file)
     yield (
-        f"Cornell box, {len(asset.points):,} samples in {len(asset.transports['local'].clusters)} clusters,"
-        f" precomputed in **{sum(seconds.values()):.0f} s** (asked: ≤ 120 s; the paper: 4 hours):"
+        f"Cornell box, {len(asset.points):,} samples in"
+        f" {len(asset.transports['local'].clusters)} clusters, precomputed in"
+        f" **{sum(seconds.values()):.0f} s** (asked: ≤ 120 s; the paper: 4 hours):"
         f" {', '.join(f'{stage} {value:.1f}' for stage, value in seconds.items())}."
         f" {cost['rays'] / 1e6:.0f} million rays fill the depth buffers;"
         f" {cost['peak_memory_bytes'] / 1e9:.1f} GB of memory at most. File: **{size / 1e6:.1f}"

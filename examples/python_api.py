@@ -15,8 +15,7 @@ scene = {
     "ball": {"type": "sphere", "center": [0, 0, 0.4], "radius": 0.3},
 }
 asset = mi_prt.precompute(scene, directions="cubemap:16", coefficients=32)
-# An asset is points and transports; this scene has no light of its own, so that of distant light was
-# made.
+# An asset is points and transports: of distant light here, as the scene has no light of its own.
 distant = asset.transports["distant"]
 print(
     f"{len(asset.points):,} points, {distant.directions}, captured variance"

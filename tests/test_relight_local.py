@@ -17,6 +17,7 @@ from mi_prt.lighting.to_mitsuba import lit_scene
 from mi_prt.output.film import light_path
 from mi_prt.output.moving import animate
 from mi_prt.output.relight import relight_to_file
+from mi_prt.precompute.settings import BY_NAME
 from mi_prt.render.image_file import to_8bit
 from mi_prt.scene.scene import open_scene
 from mi_prt.system.runtime import mitsuba
@@ -385,6 +386,9 @@ def test_command_line(from_file, tmp_path, capsys):
     stored = [t["storage"]["measured"] for t in told["transports"].values()]
     assert set().union(*stored) == {"columns", "depth", "transfer"}
     assert sum(sum(sizes.values()) for sizes in stored) < told["bytes"]
+    # each known error names the setting that lowers it
+    assert {entry["knob"] for entry in told["ledger"]} <= set(BY_NAME)
+    assert {entry["stage"].split(":")[0] for entry in told["ledger"]} == {"own", "local"}
     code, out, _ = run(
         capsys,
         "compare",
