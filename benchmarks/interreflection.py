@@ -326,7 +326,8 @@ def cornell(assets, pictures):
     yield (
         "Left: direct light alone. Middle: mi_prt, 256 coefficients,"
         f" {_distant(asset).report['bounces']} reflections (`auto`), precomputed in"
-        f" {sum(cost['seconds'].values()):.0f} s and relit in milliseconds. Right: Mitsuba's `path` without a limit of depth, 2,048 samples per pixel."
+        f" {sum(cost['seconds'].values()):.0f} s and relit in milliseconds."
+        " Right: Mitsuba's `path` without a limit of depth, 2,048 samples per pixel."
         f" Relative RMSE {metrics.relative_rmse(ours, truth):.1%}, bias"
         f" {metrics.relative_bias(ours, truth):+.2%} (of direct light alone"
         f" {metrics.relative_rmse(direct, truth):.0%} and"
