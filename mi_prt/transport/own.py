@@ -127,8 +127,8 @@ class OwnTransport(Transport):
     def ledger(self):
         """See `Transport.ledger`."""
         known = (
-            ("direct_noise", "noise of shadow rays", "lamp_samples"),
-            ("indirect_noise", "noise of reflected light", "lamp_paths"),
+            ("direct_noise", "noise of shadow rays", "lamp_tolerance"),
+            ("indirect_noise", "noise of reflected light", "lamp_rays"),
         )
         return [
             Entry("own: rays", what, self.report[key], "irradiance", "measured", knob)

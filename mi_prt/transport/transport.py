@@ -52,7 +52,7 @@ class Question:
     Raises
     ------
     SettingsError
-        If the component is another.
+        If the component is another, or `nearest` below 1.
     """
 
     light: Any
@@ -63,6 +63,10 @@ class Question:
         if self.component not in COMPONENTS:
             raise SettingsError(
                 f"component '{self.component}' is not known: use {', '.join(COMPONENTS)}"
+            )
+        if self.nearest < 1:
+            raise SettingsError(
+                f"the number of nearest directions must be at least 1, got {self.nearest}"
             )
 
 
