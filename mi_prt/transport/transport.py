@@ -30,7 +30,7 @@ def report_spec(required=(), optional=()):
     Record
     """
     number = Number(-1e30, 1e30)
-    fields = {name: number for name in (*required, *optional)}
+    fields = dict.fromkeys((*required, *optional), number)
     fields |= {"bounces": BOUNCES, "channels": CHANNELS}
     return Record(fields, ("channels", *optional), Anything())
 
