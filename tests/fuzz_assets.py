@@ -26,13 +26,11 @@ import warnings
 from collections import Counter
 from pathlib import Path
 
-import numpy as np
-
 sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1])]
 
 from mutants import TURNS, Mutator, make_traps  # noqa: E402
 
-LOAD, RELIGHT = "mi_prt:load", "fuzz_assets:relight"
+LOAD, RELIGHT = "mi_prt:load", "small_assets:relight"
 FINE = ("refused", "loaded", "typed error")
 FAILURES = ("traceback", "crash", "hang", "memory", "foreign read", "message")
 TURN = 2000  # files for a worker, so that what caches grow by does not count
@@ -44,48 +42,6 @@ EVENTS = re.compile(
     r"|system|posix_spawn|spawn|fork|forkpty|startfile|putenv|kill)$|socket\.|subprocess\.|shutil\.|urllib\."
     r"|ftplib\.|http\.|smtplib\.|pickle\.find_class$|ctypes\.dlopen$|tempfile\."
 )
-
-
-def relight(asset):
-    """Under light of all kinds that it holds; and all that it says of itself."""
-    import mi_prt
-    from mi_prt.asset.describe import describe_asset
-
-    lights = [asset.own_lights[name] for name in getattr(asset.transports.get("own"), "names", ())]
-    if "distant" in asset.transports:
-        lights.append(mi_prt.DirectionalLight((1, -1, 0.3), 2))
-        if asset.transports["distant"].basis.kind == "sh":  # maps turn in closed form
-            sky = asset.prepare_light(np.ones((2, 4, 3), np.float32))
-            asset.irradiance(sky.rotated("y", 30))
-    if asset.transports.keys() & {"distant", "local"}:
-        lights.append(mi_prt.PointLight((0.3, 1, 0.4), 2))
-    with np.errstate(all="ignore"):
-        for component in asset.components:
-            asset.relight(lights, component)
-    json.dumps(describe_asset(asset), allow_nan=False)
-    assert asset.reference_bounces is None or asset.reference_bounces >= 0
-    triangles = asset.points.layout.triangles()
-    asset.points.positions[triangles]
-    _locate(asset.points)
-
-
-def _locate(points):
-    """Light between the points, where rays hit the scene of the small assets."""
-    import drjit as dr
-    from small_assets import opened_scene
-
-    from mi_prt.system.runtime import mitsuba
-
-    mi, scene = mitsuba(), opened_scene()
-    x, z = dr.meshgrid(dr.linspace(mi.Float, -0.9, 0.9, 8), dr.linspace(mi.Float, -0.9, 0.9, 8))
-    ray = mi.Ray3f(mi.Point3f(x, 1.9, z), mi.Vector3f(0.1, -1, -0.5))
-    pi = scene.mi_scene.ray_intersect_preliminary(ray)
-    active = pi.is_valid()
-    si = pi.compute_surface_interaction(ray)
-    locator = points.locator(scene)
-    values, found = locator.interpolated(mi.Float(points.albedo.ravel()), pi, si, ray, active)
-    index, _ = locator.nearest(pi, si, ray, active)
-    dr.eval(values, found, index)
 
 
 class Watch:

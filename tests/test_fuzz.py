@@ -149,12 +149,26 @@ def small(tmp_path_factory):
     return small_assets.make(tmp_path_factory.mktemp("small"))
 
 
+def test_no_hostile_container_does_harm(good):
+    """3,200 mutants of the file above. Some of each kind must load, else the fuzzer would reach no
+    deeper code.
+    """
+    code, counts, failures, text = fuzz(
+        good, "--count", 3200, "--load", "test_fuzz:load", "--relight", "test_fuzz:relight"
+    )
+    assert not failures and code == 0, text[-4000:]
+    assert sum(counts.values()) == 3200
+    assert {kind for kind, outcome in counts if outcome == "refused"} == {*TURNS, "bomb"}
+    loaded = {kind: count for (kind, outcome), count in counts.items() if outcome == "loaded"}
+    assert {"flipped", "own", "entry", "layout", "text"} <= loaded.keys(), text
+
+
 def test_no_hostile_file_does_harm(small):
-    """240 mutants of each small asset; loaded, relit, described, and looked up between points.
+    """80 mutants of each small asset: loaded, relit, described, and looked up between points.
 
     Some of each kind must load, else the fuzzer would reach no deeper code.
     """
-    count = 240 * len(small)
+    count = 80 * len(small)
     code, counts, failures, text = fuzz(*small.values(), "--count", count, "--seconds", 120)
     assert not failures and code == 0, text[-4000:]
     assert sum(counts.values()) == count

@@ -89,6 +89,8 @@ class Patches(Layout):
         """
         u, v = self.levels.astype(np.int64).T
         sizes = node_count(u, v)
+        if not len(u):
+            raise ValueError("layout/levels are of no patch")
         if (u < 1).any() or (self.offsets != np.cumsum(sizes) - sizes).any():
             raise ValueError("layout/offsets do not fit the levels of the patches")
         if sizes.sum() != len(self.nodes):

@@ -160,5 +160,5 @@ class Spacing(Layout):
         """See `Layout.from_arrays`."""
         radius = report.get("radius")
         if not isinstance(radius, float) or not 1e-15 < radius < 1e15:
-            raise ValueError(f"points.report.radius is {radius!r}, no positive number")
+            raise ValueError(f"points.report.radius is {ascii(radius)[:60]}, no length in metres")
         return cls(radius)
