@@ -67,8 +67,8 @@ class Asset:
         rotate : (axis, degrees), optional
             Turns the distant light.
         scene : Scene, path, dict or mi.Scene, optional
-            Needed where the light contains distant light of the scene, and only then opened; by
-            default where it was.
+            Needed where the light contains distant light of the scene, or lamps of which the asset
+            holds no transport of their own, and only then opened; by default where it was.
 
         Returns
         -------
@@ -86,7 +86,18 @@ class Asset:
         names = {emitter["name"]: emitter["distant"] for emitter in self.emitters}
         opened = scene if scene_is_open(scene) else lambda: open_scene_of(self, scene)
         light = resolve(light, opened, names)
+        if not scene_is_open(scene) and any(map(self._is_stood_in_for, light.parts)):
+            light = resolve(light, open_scene_of(self, scene), names)
         return light if rotate is None else light.rotated(*rotate)
+
+    def _is_stood_in_for(self, part):
+        """Whether a part is a lamp for which only transport answers that asks where it shines."""
+        transports = self.transports.values()
+        return (
+            part.own_name is not None
+            and not any(t.takes(part) for t in transports)
+            and any(t.stands_in_for(part) for t in transports)
+        )
 
     def _own_light(self):
         """The scene's own light, as far as the asset holds it."""
