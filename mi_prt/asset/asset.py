@@ -86,15 +86,17 @@ class Asset:
         names = {emitter["name"]: emitter["distant"] for emitter in self.emitters}
         opened = scene if scene_is_open(scene) else lambda: open_scene_of(self, scene)
         light = resolve(light, opened, names)
-        if not scene_is_open(scene) and any(map(self._is_stood_in_for, light.parts)):
+        if any(map(self._needs_place, light.parts)):
             light = resolve(light, open_scene_of(self, scene), names)
         return light if rotate is None else light.rotated(*rotate)
 
-    def _is_stood_in_for(self, part):
-        """Whether a part is a lamp for which only transport answers that asks where it shines."""
+    def _needs_place(self, part):
+        """Whether only transport answers for a part that must know where it shines, and the part
+        does not.
+        """
         transports = self.transports.values()
         return (
-            part.own_name is not None
+            not part.is_placed
             and not any(t.takes(part) for t in transports)
             and any(t.stands_in_for(part) for t in transports)
         )
