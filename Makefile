@@ -3,20 +3,28 @@
 venv   := .venv
 python := $(venv)/bin/python
 stamp  := $(venv)/.ready
+JOBS   := 2
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test clean FORCE
+.PHONY: help demo check test clean FORCE
 
 help:
 	@echo 'make demo    render and relight the example scene'
+	@echo 'make check   format, lint and types'
 	@echo 'make test    run the tests (ARGS="-k name" passes options to pytest)'
 	@echo 'make clean   remove the Python environment; the next make sets it up again'
 
 demo: $(stamp)
 	$(python) examples/demo.py $(ARGS)
 
+check: $(stamp)
+	$(venv)/bin/ruff format --check .
+	$(venv)/bin/ruff check .
+	$(venv)/bin/basedpyright --pythonpath $(python)
+
+# Two processes: Mitsuba and BLAS use all cores inside each, and what is left idle by one the other takes.
 test: $(stamp)
-	$(python) -m pytest -q $(ARGS)
+	$(python) -m pytest -q -n $(JOBS) --dist loadfile $(ARGS)
 
 clean:
 	rm -rf $(venv)

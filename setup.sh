@@ -161,7 +161,7 @@ if ! { usable_python "$venv/bin/python" && "$venv/bin/python" -m pip --version >
     make_venv
 fi
 say "installing the Python packages into $venv (the first time this takes a minute or two)"
-"$venv/bin/python" -m pip install --quiet --disable-pip-version-check -e '.[test]'
+"$venv/bin/python" -m pip install --quiet --disable-pip-version-check -e '.[test,dev]'
 provide_rays || fail "$advice"$'\n'"setup: do this, then run make again: Mitsuba cannot render yet"
 provide_raster || fail "$advice"$'\n'"setup: do this, then run make again: nothing draws without a screen yet"
 pwd -P >"$venv/.ready"

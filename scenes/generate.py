@@ -52,7 +52,7 @@ TEAPOT_PARTS = {
 PART_OF_PATCH = {patch: part for part, patches in TEAPOT_PARTS.items() for patch in patches}
 
 
-# ---------------------------------------------------------------------------------------------------- Bezier patches
+# ----------------------------------------------------------------------------------- Bezier patches
 
 
 def read_patches(path: Path = PATCH_FILE) -> list[tuple[str, str, np.ndarray]]:
@@ -120,7 +120,7 @@ def evaluate_patch(net: np.ndarray, u: np.ndarray, v: np.ndarray) -> tuple[np.nd
     return combine(bv, bu), normal / np.linalg.norm(normal, axis=-1, keepdims=True)
 
 
-# -------------------------------------------------------------------------------------------------------------- meshes
+# ------------------------------------------------------------------------------------------- meshes
 
 
 def grid_faces(rows: int, columns: int) -> np.ndarray:
@@ -249,7 +249,7 @@ def write_ply(path: Path, vertex: np.ndarray, face: np.ndarray, comment: str) ->
     )
 
 
-# --------------------------------------------------------------------------------------------------- environment maps
+# --------------------------------------------------------------------------------- environment maps
 
 
 def latlong_directions(rows: int, columns: int) -> np.ndarray:
@@ -328,7 +328,7 @@ def sky_evening() -> np.ndarray:
 
 
 def sky_morning() -> np.ndarray:
-    """A bright hazy sky with a warm sun 36 degrees up, for a room that it lights through a window."""
+    """A bright hazy sky with a warm sun 36 degrees up, for a room to light through a window."""
     return sky(
         elevation=36.0,
         zenith=(1.5, 2.2, 3.6),
@@ -349,7 +349,7 @@ def write_exr(path: Path, image: np.ndarray) -> None:
         file.write(str(path))
 
 
-# ------------------------------------------------------------------------------------------------------------ textures
+# ----------------------------------------------------------------------------------------- textures
 
 
 def value_noise(

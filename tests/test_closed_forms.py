@@ -357,7 +357,7 @@ def test_sunset_is_usable():
     the user to repair.
     """
     light = scene_light(open_scene(scene(ball=sphere(), sky=sunsky(at_altitude(2)))))
-    assert light.maps[0].pixels.max() > 100
+    assert light.parts[0].pixels.max() > 100
 
 
 def test_irradiance_under_a_sky_without_sun():

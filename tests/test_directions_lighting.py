@@ -26,9 +26,9 @@ import mi_prt
 from mi_prt import DirectionalLight, EnvironmentMap, Light, LightError, LightWarning, SettingsError
 from mi_prt.directions import Cubemap, parse_directions
 from mi_prt.lighting.cells import cell_radiance
+from mi_prt.lighting.from_mitsuba import scene_light
 from mi_prt.lighting.light import as_light
 from mi_prt.lighting.rotation import rotation_matrix
-from mi_prt.lighting.from_mitsuba import scene_light
 from mi_prt.lighting.to_mitsuba import lit_scene
 from mi_prt.scene.scene import open_scene
 from mi_prt.system.runtime import mitsuba
@@ -401,7 +401,7 @@ def test_prepared_light_turns_like_the_map():
     for axis, degrees in [("y", 0), ("y", 33), ((1, 2, 3), 120), ("z", -7)]:
         now, then = prepared.rotated(axis, degrees), exact.rotated(axis, degrees)
         np.testing.assert_allclose(energy_of(now), energy_of(then), rtol=1e-4)
-        without = [cell_radiance(l.parts[0], LATTICE) for l in (now, then)]
+        without = [cell_radiance(light.parts[0], LATTICE) for light in (now, then)]
         assert relative_l2(*without) < 0.02
         np.testing.assert_allclose(
             cell_radiance(flat.rotated(axis, degrees), LATTICE) / [1, 2, 3], 1, rtol=1e-3

@@ -559,6 +559,12 @@ def test_the_hash_follows_geometry_and_sides_and_nothing_else():
     assert len({same, *different}) == 1 + len(different)
 
 
+def test_the_appearance_follows_every_channel_of_a_colour():
+    """Reflected light depends on each of them."""
+    colours = ([0.2, 0.4, 0.6], [0.3, 0.4, 0.6], [0.2, 0.5, 0.6], [0.2, 0.4, 0.7])
+    assert len({open_scene(scene(a=rectangle(bsdf=diffuse(c)))).appearance for c in colours}) == 4
+
+
 def test_the_hash_of_faceted_and_instanced_shapes(tmp_path):
     """A faceted mesh has no stored normals whose sign could tell that it was flipped; an instance
     may move.

@@ -87,7 +87,7 @@ def test_shows_the_weighted_mean_at_each_pixels_hit(name):
         seen = splatted(points, irradiance, scene, sensor)
     width, height = sensor.film().crop_size()
     assert seen.shape == (height, width, 3) and seen.dtype == np.float32
-    si, directions = hits(scene, sensor)
+    si, _ = hits(scene, sensor)
     hit = np.array(si.is_valid())
     assert hit.mean() > 0.5
     normals = np.array(si.sh_frame.n).T[hit]
@@ -453,7 +453,8 @@ def test_errors_name_what_is_supported():
 PROGRAM = """
 import sys, numpy as np
 from test_splats import diffuse, rectangle, sphere, splatted, surroundings
-parts = dict(floor=rectangle(bsdf=diffuse([0.2, 0.5, 0.8])), ball=sphere(radius=0.5, bsdf=diffuse()))
+floor = rectangle(bsdf=diffuse([0.2, 0.5, 0.8]))
+parts = dict(floor=floor, ball=sphere(radius=0.5, bsdf=diffuse()))
 scene, points, sensor = surroundings(**parts)
 np.save(sys.argv[1], splatted(points, 3 + points.positions, scene, sensor))
 """

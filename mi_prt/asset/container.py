@@ -143,7 +143,7 @@ def _blocks(array, name):
 
 
 def is_asset(path):
-    """Whether a file looks like an asset, of this or an older version; False if it cannot be read."""
+    """Whether a file looks like an asset of any version; False if it cannot be read."""
     try:
         if not stat.S_ISREG(os.stat(path).st_mode):
             return False

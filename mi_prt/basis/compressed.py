@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -19,8 +20,8 @@ class Compressed:
         (n, 3, d) where reflections colour the light and the basis does not join channels.
     """
 
-    basis: object
-    coefficients: object
+    basis: Any
+    coefficients: Any
 
     def __len__(self):
         return self.coefficients.shape[0]

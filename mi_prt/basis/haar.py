@@ -16,6 +16,7 @@ weight is an orthonormal coefficient; with aᵢ = √wᵢ tᵢ these are (√w�
 from dataclasses import dataclass
 from functools import cache, cached_property
 from math import inf, log2, sqrt
+from typing import cast
 
 import numpy as np
 import scipy.sparse
@@ -69,6 +70,11 @@ class HaarBasis(Basis):
         """See `check_haar`."""
         check_haar(directions, None if components == "auto" else components)
 
+    def check_stored(self, directions):
+        """On a cubemap whose sides are a power of two; see `Basis.check_stored`."""
+        super().check_stored(directions)
+        check_haar(directions, len(self))
+
     @classmethod
     def coefficient_bytes(cls, points, directions, components, rays_per_direction=1):
         """Each number with the index of its wavelet."""
@@ -88,7 +94,7 @@ class HaarBasis(Basis):
     def shapes(cls, channels):
         """See `Basis.shapes`."""
         return {
-            "sqrt_weights": Array("f4", ("s",), least=0, unit="sr^(1/2)"),
+            "sqrt_weights": Array("f4", ("s",), least=1e-12, unit="sr^(1/2)"),
             "captured_variance": Array("f8", ("d",)),
         }
 
@@ -202,6 +208,11 @@ class SharedHaarBasis(LinearBasis):
     def check(cls, directions, components):
         """See `check_haar`."""
         check_haar(directions, None if components == "auto" else components)
+
+    def check_stored(self, directions):
+        """On a cubemap whose sides are a power of two; see `Basis.check_stored`."""
+        super().check_stored(directions)
+        check_haar(directions, len(self))
 
     @classmethod
     def fit_bytes(cls, points, directions, components):
@@ -401,11 +412,11 @@ def fit_haar_shared(
     components, residual = _fewest(target, energies[order], variance)
     s = len(energies)
     check_room(f"a basis of {components:,} wavelets", FIT_BYTES * components * s, max_bytes)
-    chosen = order[:components]
+    chosen, lattice = order[:components], cast(Cubemap, rows.directions)
     vectors = np.zeros((components, s), np.float32)
     vectors[np.arange(components), chosen] = 1
     basis = SharedHaarBasis(
-        haar_transform(rows.directions.resolution).inverse(vectors) * rows.sqrt_weights,
+        haar_transform(lattice.resolution).inverse(vectors) * rows.sqrt_weights,
         np.zeros(s, np.float32),
         rows.sqrt_weights,
         shares(energies[chosen], variance),

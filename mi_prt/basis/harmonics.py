@@ -5,6 +5,7 @@ that they make.
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import inf, isqrt, pi, sqrt
+from typing import Any
 
 import numpy as np
 import scipy.linalg
@@ -184,6 +185,12 @@ class HarmonicBasis(LinearBasis):
         """The harmonics as functions."""
         return FIT_BYTES * components * directions
 
+    def check_stored(self, directions):
+        """All functions of its bands are there; see `Basis.check_stored`."""
+        super().check_stored(directions)
+        if self.bands**2 != len(self):
+            raise ValueError(f"{len(self)} spherical harmonics are no whole bands")
+
     @property
     def bands(self):
         """Number of bands."""
@@ -236,7 +243,7 @@ class HarmonicMap(DistantPart):
     rotation : (3, 3) float64
     """
 
-    environment: object
+    environment: Any
     functions: tuple
     coefficients: np.ndarray
     rotation: np.ndarray = field(default_factory=lambda: np.eye(3))

@@ -128,7 +128,7 @@ def fit_pca(
     n, s = rows.shape
     variance = max(squares - n * float(mean @ mean), 0.0)
     largest = min(n - 1, s)
-    components = target.components if target.variance is None else min(FIRST_COMPONENTS, largest)
+    components = min(FIRST_COMPONENTS, largest) if target.components is None else target.components
     vectors = np.zeros((s, 0), np.float32)
     while True:
         values, vectors = _leading(rows, mean, components, vectors, seed, progress, keep, max_bytes)
@@ -196,7 +196,8 @@ def _leading(rows, mean, components, start, seed, progress, keep, max_bytes):
     """Leading squared singular values, descending, and right singular vectors (s, components) of
     the centred, weighted rows.
     """
-    exact, needed = _plan(*rows.shape, components)
+    n, s = rows.shape
+    exact, needed = _plan(n, s, components)
     check_room(f"fitting {components:,} components", needed, max_bytes)
     if exact:
         return _exact(rows, mean, components, progress)

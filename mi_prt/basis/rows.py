@@ -1,10 +1,12 @@
 """A matrix of transport that is only ever seen in blocks of rows."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import reduce
 
 import numpy as np
 
+from ..directions.lattice import DirectionLattice
 from ..system.parallel import BLOCK_ROWS, map_chunks
 
 # parts that the rows are split into for the threads; fixed, so that sums do not depend on their
@@ -28,7 +30,8 @@ class Rows:
 
     read: Callable
     index: np.ndarray
-    directions: object
+    directions: DirectionLattice
+    sqrt_weights: np.ndarray = field(init=False, repr=False)
 
     def __post_init__(self):
         object.__setattr__(
@@ -54,10 +57,8 @@ class Rows:
         order, so that results are too.
         """
         index = self.index if index is None else index
-        total = None
-        for part in map_chunks(function, np.array_split(index, CHUNKS)):
-            total = part if total is None else tuple(a + b for a, b in zip(total, part))
-        return total
+        parts = map_chunks(function, np.array_split(index, CHUNKS))
+        return reduce(lambda total, part: tuple(a + b for a, b in zip(total, part)), parts)
 
     def moments(self):
         """Weighted mean (s,) float64 of the rows, and the sum of their weighted squares."""

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from numbers import Integral, Real
+from typing import Any
 
 import numpy as np
 
@@ -51,6 +52,7 @@ class Target:
         """Largest Σ‖T − T̂‖² that captures the share of the variance; where nothing varies, what
         rounding leaves.
         """
+        assert self.variance is not None, "asked of a target by components"
         return (1 - self.variance) * variance if variance > ROUNDING * energy else ROUNDING * energy
 
 
@@ -69,7 +71,7 @@ class Fit:
         Σ‖T‖².
     """
 
-    basis: object
+    basis: Any
     residual: float
     variance: float
     energy: float

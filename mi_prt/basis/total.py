@@ -7,7 +7,8 @@ of transport, only coefficients.
 """
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, reduce
+from operator import add
 
 import numpy as np
 import scipy.linalg
@@ -178,7 +179,9 @@ def _scatter(direct, indirect, kept):
         totals = _totals(direct, indirect, block)[kept[block]].astype(np.float64)
         return totals.T @ totals, totals.sum(axis=0)
 
-    scatter, total = (sum(parts) for parts in zip(*map_chunks(sums, range(0, len(direct), _CHUNK))))
+    scatter, total = (
+        reduce(add, parts) for parts in zip(*map_chunks(sums, range(0, len(direct), _CHUNK)))
+    )
     return scatter, total / max(int(kept.sum()), 1)
 
 

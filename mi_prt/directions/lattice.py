@@ -25,7 +25,7 @@ class DirectionLattice(ABC):
     """
 
     @abstractmethod
-    def __len__(self):
+    def __len__(self) -> int:
         """Number of directions s."""
 
     @cached_property
@@ -35,11 +35,11 @@ class DirectionLattice(ABC):
 
     @property
     @abstractmethod
-    def solid_angles(self):
+    def solid_angles(self) -> np.ndarray:
         """Exact solid angles w of the cells, (s,) float64 in sr, Σw = 4π; kept once computed."""
 
     @abstractmethod
-    def subdivided(self, rays):
+    def subdivided(self, rays) -> tuple[np.ndarray, np.ndarray]:
         """Split every cell into `rays` sub-cells.
 
         Parameters
@@ -61,7 +61,7 @@ class DirectionLattice(ABC):
         """
 
     @abstractmethod
-    def cells(self, vectors):
+    def cells(self, vectors) -> np.ndarray:
         """Index of the cell that each direction falls in.
 
         Parameters

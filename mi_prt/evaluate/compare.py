@@ -5,6 +5,7 @@ explained.
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -153,11 +154,11 @@ class _Points:
     They are drawn where the sensor looks and evenly over all points, half each.
     """
 
-    asset: object
-    opened: object
-    truth: object
-    camera: object
-    bounces: object
+    asset: Any
+    opened: Any
+    truth: Any
+    camera: Any
+    bounces: Any
     seed: int
 
     def __post_init__(self):

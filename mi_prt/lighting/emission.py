@@ -3,6 +3,7 @@ of emission.
 """
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -57,12 +58,12 @@ class Emission(LocalPart):
         If a value is not finite, an intensity negative, or a shape another.
     """
 
-    positions: np.ndarray
-    axes: np.ndarray
-    intensity: np.ndarray
-    cosine: np.ndarray
-    cutoff: np.ndarray
-    beam: np.ndarray
+    positions: Any
+    axes: Any
+    intensity: Any
+    cosine: Any
+    cutoff: Any
+    beam: Any
     exact: dict = field(init=False, repr=False)
 
     kind = "emission"

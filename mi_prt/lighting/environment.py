@@ -5,6 +5,7 @@ import warnings
 from copy import copy
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -57,7 +58,7 @@ class EnvironmentMap(DistantPart):
         are NaN or infinite, or negative pixels carry more than 1e-3 of the energy.
     """
 
-    source: object = field(repr=False)
+    source: Any = field(repr=False)
     rotation: np.ndarray = field(default_factory=lambda: np.eye(3))
     scale: float = 1.0
     pixels: np.ndarray = field(init=False, repr=False)

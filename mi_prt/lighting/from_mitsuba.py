@@ -5,14 +5,14 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from ..errors import LightError
-from ..scene.traversal import transform_of
+from ..scene.traversal import digest_of, transform_of
 from ..system.runtime import mitsuba
 from .directional import DirectionalLight
 from .environment import EnvironmentMap
 from .light import Light
 from .sky import baked, evaluate, origin, rgb_of
 
-_known = WeakKeyDictionary()  # of an OwnLight: its digest, and the part that it is
+_known = WeakKeyDictionary()  # of an OwnLight: digest of its parameters, and the part that it is
 
 
 def scene_light(scene):
@@ -56,14 +56,14 @@ def distant_part(own):
     part = known_part(own)
     if part is None:
         part = _part_of(own.emitter)
-        _known[own] = own.digest(), part
+        _known[own] = digest_of([own.emitter]), part
     return part
 
 
 def known_part(own):
     """What `distant_part` returned for an emitter as it is now; None if it did not."""
     digest, part = _known.get(own, (None, None))
-    return part if part is not None and digest == own.digest() else None
+    return part if part is not None and digest == digest_of([own.emitter]) else None
 
 
 def _part_of(emitter):

@@ -8,6 +8,7 @@ depend on the map's resolution.
 """
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -36,7 +37,7 @@ class LatticeMap(DistantPart):
     rotation : (3, 3) float64
     """
 
-    directions: object
+    directions: Any
     cell_means: np.ndarray
     rotation: np.ndarray
 

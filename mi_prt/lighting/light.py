@@ -3,6 +3,7 @@
 import re
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -28,7 +29,7 @@ class Light:
         If something else is among them.
     """
 
-    parts: tuple = ()
+    parts: Any = ()  # any iterable; stored as a tuple
 
     def __post_init__(self):
         object.__setattr__(self, "parts", tuple(self.parts))

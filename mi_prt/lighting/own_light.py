@@ -2,8 +2,7 @@
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-
-import numpy as np
+from typing import Any
 
 from ..errors import LightError
 from .from_mitsuba import distant_part
@@ -36,7 +35,7 @@ class SceneLight(LightPart):
     """
 
     name: str | None = None
-    factor: np.ndarray = 1.0
+    factor: Any = 1.0  # stored as (3,) float64
     turns: tuple = field(default=())
 
     kind = "scene"
@@ -107,8 +106,8 @@ class Lamp(LocalPart):
     """
 
     name: str
-    factor: np.ndarray = 1.0
-    own: object = None
+    factor: Any = 1.0  # stored as (3,) float64
+    own: Any = None
 
     kind = "lamp"
 
@@ -241,4 +240,4 @@ class _OwnLights:
     def _own_lights(self):
         if self._scene is None:
             raise LightError("the scene's own light is needed: pass the scene, or another light")
-        return (self._scene if self.is_open else self._scene()).own_lights
+        return (self._scene if self.is_open else self._scene()).own_lights  # pyright: ignore[reportAttributeAccessIssue]

@@ -76,7 +76,7 @@ class SpotLight(LocalPart):
 
     def emission(self):
         """See `LocalPart.emission`."""
-        cutoff, beam = np.radians([[self.cutoff_degrees], [self.beam_degrees]])
+        cutoff, beam = np.radians(np.array([[self.cutoff_degrees], [self.beam_degrees]], float))
         return Emission(
             self.position[None], self.direction[None], self.intensity[None], [0], cutoff, beam
         )

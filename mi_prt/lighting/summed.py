@@ -1,5 +1,8 @@
 """Several environment maps as one: Mitsuba takes one in a scene."""
 
+from functools import reduce
+from operator import add
+
 import numpy as np
 
 from .environment import EnvironmentMap
@@ -42,7 +45,9 @@ def summed_maps(maps):
         # beside a pole: in it, all columns would be one direction
         rows = np.clip(rows + first, 1e-6, height - 1 - 1e-6)
         vectors = pixel_directions(rows, columns, height, width) @ largest.rotation.T
-        pixels[first : first + step] = sum(m.at(vectors) for m in maps).reshape(-1, width, 3)
+        pixels[first : first + step] = reduce(add, (m.at(vectors) for m in maps)).reshape(
+            -1, width, 3
+        )
     return EnvironmentMap(pixels, largest.rotation)
 
 

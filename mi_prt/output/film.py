@@ -14,6 +14,7 @@ from ..render.image_file import to_8bit, write_displayed
 from ..system.files import check_writable, replacing
 
 VIDEOS = (".mp4", ".gif")
+FRAMES, FPS = 48, 25  # of a film, by default
 MAX_FPS = {".mp4": 240, ".gif": 50}  # viewers slow down a GIF of more
 PATH_FORM = "write it as 'x,y,z x,y,z …', two or more positions separated by spaces or semicolons"
 _STEPS = 1024  # of the polygon that measures and stands for each piece of a path
@@ -217,7 +218,8 @@ def _write_mp4(path, images, fps):
         codec.colorspace, codec.color_range = Colorspace.ITU709, ColorRange.MPEG
         codec.color_primaries, codec.color_trc = ColorPrimaries.BT709, ColorTrc.IEC61966_2_1
         count = 0
-        for count, image in enumerate(chain([first], map(to_8bit, images)), 1):
+        for image in chain([first], map(to_8bit, images)):
+            count += 1
             image = np.pad(
                 image,
                 [(0, height - image.shape[0]), (0, width - image.shape[1]), (0, 0)],
@@ -234,11 +236,12 @@ def _write_mp4(path, images, fps):
 
 def _write_gif(path, images, fps):
     import av
+    import av.filter
 
     first = to_8bit(next(images))
     height, width = first.shape[:2]
     graph = av.filter.Graph()  # a palette for each frame, so that no two frames must be in memory
-    source = graph.add_buffer(width=width, height=height, format="rgb24", time_base=1 / fps)
+    source = graph.add_buffer(width=width, height=height, format="rgb24", time_base=1 / fps)  # pyright: ignore[reportArgumentType]
     copies, sink = graph.add("split"), graph.add("buffersink")
     palette, applied = (
         graph.add("palettegen", "stats_mode=single"),
@@ -254,10 +257,11 @@ def _write_gif(path, images, fps):
         stream = file.add_stream("gif", rate=fps)
         stream.width, stream.height, stream.pix_fmt = width, height, "pal8"
         count = 0
-        for count, image in enumerate(chain([first], map(to_8bit, images)), 1):
+        for image in chain([first], map(to_8bit, images)):
+            count += 1
             frame = av.VideoFrame.from_ndarray(image, format="rgb24")
             frame.pts, frame.time_base = count - 1, 1 / fps
             graph.push(frame)
-            file.mux(stream.encode(graph.pull()))
+            file.mux(stream.encode(graph.pull()))  # pyright: ignore[reportArgumentType]
         file.mux(stream.encode())
         return count

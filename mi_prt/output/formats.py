@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from ..errors import SettingsError
 from ..system.registry import Registry
@@ -28,11 +28,11 @@ class Relit:
         Linear radiance as a sensor sees it, for formats that are pictures.
     """
 
-    asset: object
-    irradiance: object
-    radiance: object
+    asset: Any
+    irradiance: Any
+    radiance: Any
     exposure: float
-    image: object = None
+    image: Any = None
 
 
 class Format(ABC):

@@ -107,7 +107,7 @@ class PatchLocator(Locator):
         """Fill the tables that lead from (surface, primitive) to patches."""
         mi = mitsuba()
         faces = _FaceIndex(points)
-        analytic = {s["signature"]: s["first_patch"] for s in points.surfaces}
+        analytic = {s["signature"]: s["first_patch"] for s in points.surfaces if s["patches"] > 0}
         tables, starts, total = [np.empty(0, np.int64)], [], 0
         for surface in scene.surfaces:
             if surface.kind not in TESSELLATED_SHAPES:
@@ -120,6 +120,9 @@ class PatchLocator(Locator):
                 else faces.take(surface)
             )
             missing = int((patch == NO_PATCH).sum())
+            if missing == len(patch) and surface.shape.is_emitter():
+                starts.append(NO_PATCH)  # a light that was added: it reflects nothing
+                continue
             if missing:
                 raise SceneError(
                     f"shape '{surface.name}' has {missing} faces that the asset does not know: "

@@ -369,4 +369,4 @@ class _Kept:
         met = np.flatnonzero(np.array(self._met)[first:])
         columns = [np.array(column).reshape(self._rows, -1)[first:] for column in self._columns]
         fields = [column[met] for column in columns[:6]]
-        return Hits(*fields[:5], fields[5][:, 0].astype(np.int32)), np.stack(columns[6:], axis=1)
+        return Hits(*fields[:5], fields[5][:, 0].astype(np.int32)), np.stack(columns[6:], axis=1)  # pyright: ignore[reportCallIssue]

@@ -170,7 +170,7 @@ class DistantBuilder(Builder):
                 )
             if target.components is None:
                 channels = self._budget.channels
-                size = held_coefficient_bytes(settings, *transport.shape, count, channels)
+                size = held_coefficient_bytes(settings, *transport.shape, count, channels)  # pyright: ignore[reportCallIssue]
                 check_room(f"keeping {count:,} coefficients of {len(fitted):,} points", size, room)
         return fit
 

@@ -3,7 +3,7 @@
 import time
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -50,15 +50,15 @@ class Job:
         All that the result depends on: what must not change between a run and its continuation.
     """
 
-    scene: object
-    settings: object
-    points: object
-    clusters: object
-    flights: object
-    progress: object
+    scene: Any
+    settings: Any
+    points: Any
+    clusters: Any
+    flights: Any
+    progress: Any
     limit: int
     clock: Clock = field(default_factory=Clock)
-    workspace: object = None
+    workspace: Any = None
     identity: dict = field(default_factory=dict)
 
     def trace(self, stage, sampler, rows):

@@ -222,7 +222,7 @@ class LocalBuilder(Builder):
     def _transfer(self, senders, parts):
         """The Transfer, or None where nothing is reflected from point to point; and its report."""
         job, settings = self.job, self.job.settings
-        missed, met = np.sum([part["missed"] for part in parts], axis=0, dtype=np.float64)
+        missed, met = np.sum([part["missed"] for part in parts], axis=0, dtype=np.float64)  # pyright: ignore[reportGeneralTypeIssues]
         back = np.concatenate([part["back"] for part in parts]).astype(np.float64)
         if not back.any():
             return None, {"bounces": 0}

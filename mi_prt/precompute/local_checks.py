@@ -64,7 +64,7 @@ def visibility_errors(scene, points, transport, places, lanes):
     wrong = facing = 0
     squares = []
     for place, expected in zip(places, truth.T):
-        emission = emission_of(as_light(PointLight(place, 1.0)))
+        emission = emission_of(as_light(PointLight(place, np.ones(3))))
         _, averaged = direct.irradiance(emission)
         found, open_air = averaged[:, 0], _unblocked(points, place)
         above = (open_air > 0) & shown

@@ -1,6 +1,7 @@
 """Kinds of options: how a value is checked, whether it comes from Python or as text."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -26,7 +27,7 @@ class Option:
     """
 
     name: str
-    default: object
+    default: Any
     help: str
     metavar: str
     group: str = "general"
@@ -98,7 +99,8 @@ class Real(Option):
             raise SettingsError(f"{self.words} {value!r} is {either} a number") from None
         if not self.least <= number < self.below:
             raise SettingsError(
-                f"{self.words} must be at least {self.least:g} and below {self.below:g}, got {value}"
+                f"{self.words} must be at least {self.least:g} and below {self.below:g},"
+                f" got {value}"
             )
         return number
 
@@ -118,7 +120,7 @@ class Flag(Option):
 class Choice(Option):
     """One of some names; a mapping or sequence of them, asked when a value is checked."""
 
-    among: object = ()
+    among: Any = ()
 
     def check(self, value):
         """See `Option.check`."""

@@ -5,6 +5,7 @@ direct transport's coefficients.
 import zlib
 from contextlib import closing
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -61,10 +62,10 @@ class IndirectTransport:
         Most rays of one wavefront.
     """
 
-    job: object
-    transport: object
-    directions: object
-    carrier: object
+    job: Any
+    transport: Any
+    directions: Any
+    carrier: Any
     direct: np.ndarray
     blocked: np.ndarray
     lanes: int
@@ -214,7 +215,7 @@ class IndirectTransport:
         sampler = self._path_sampler(demand, self._points)
         m = self.direct.shape[1]
         # What is kept are coefficients, which mean nothing in another span.
-        name = f"paths-{zlib.crc32(np.ascontiguousarray(self.carrier.span.vectors)):08x}"
+        name = f"paths-{zlib.crc32(np.ascontiguousarray(self.carrier.span.vectors).data):08x}"
         with closing(self._rows(name, sampler.row_bytes(m))) as rows:
             self.job.trace("indirect", sampler, rows)
             halves, energies = _unpacked(rows[:], demand.channels, m)

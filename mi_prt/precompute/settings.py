@@ -3,6 +3,7 @@ documentation are made.
 """
 
 from dataclasses import make_dataclass
+from typing import TYPE_CHECKING, Any
 
 from ..basis.basis import BASES
 from ..basis.target import Target
@@ -239,6 +240,10 @@ BY_NAME = {option.name: option for option in OPTIONS}
 
 class _Settings:
     """What all settings do; the fields are those of `OPTIONS`."""
+
+    if TYPE_CHECKING:  # the fields are made from a table, which a type checker does not see
+
+        def __getattr__(self, name) -> Any: ...
 
     def __post_init__(self):
         for option in OPTIONS:

@@ -87,8 +87,9 @@ class RowFile:
     def __init__(self, path, count, row_bytes):
         self.count, self.row_bytes = count, row_bytes
         with _typed(path):
-            self._file = open(path, "a+b", buffering=0)
-            self._journal = open(path.with_suffix(".journal"), "a+b", buffering=0)
+            # both stay open as long as this object: `close` closes them
+            self._file = path.open("a+b", buffering=0)
+            self._journal = path.with_suffix(".journal").open("a+b", buffering=0)
             self.filled = self._restored()
 
     def _restored(self):

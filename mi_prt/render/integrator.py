@@ -47,9 +47,10 @@ def _plugin_class(variant):
     class PRTIntegrator(mi.SamplingIntegrator):
         """Precomputed radiance transfer (`prt`).
 
-        Shows a scene under its emitters with the transports of an asset. The irradiance at the asset's points is
-        interpolated at each hit and multiplied by the albedo there, so textures keep their own
-        resolution; emitters and the background are shown as Mitsuba's own integrators show them.
+        Shows a scene under its emitters with the transports of an asset. The irradiance at the
+        asset's points is interpolated at each hit and multiplied by the albedo there, so textures
+        keep their own resolution; emitters and the background are shown as Mitsuba's own
+        integrators show them.
 
         Parameters (plugin)
         -------------------
@@ -109,7 +110,7 @@ def _plugin_class(variant):
             hit = active & si.is_valid()
 
             # --- light that the surface reflects
-            irradiance, found = self._locator.interpolated(self._irradiance, pi, si, ray, hit)
+            irradiance, found = self._locator.interpolated(self._irradiance, pi, si, ray, hit)  # pyright: ignore[reportOptionalMemberAccess]
             if self._emitters is not None:
                 irradiance += self._emitters.irradiance(si, ray, sampler, hit)
                 found = hit
@@ -217,13 +218,13 @@ def integrator_for(asset, irradiance=None, direct="points"):
             raise SettingsError(
                 f"irradiance must be of shape ({len(asset.points)}, 3), got {irradiance.shape}"
             )
-    return _plugin_class(mi.variant())(mi.Properties("prt"), asset, irradiance, direct)
+    return _plugin_class(mi.variant())(mi.Properties("prt"), asset, irradiance, direct)  # pyright: ignore[reportCallIssue]
 
 
 def _load(filename):
     import mitsuba as mi
 
     try:
-        return load(str(mi.file_resolver().resolve(filename)))
+        return load(str(mi.file_resolver().resolve(filename)))  # pyright: ignore[reportCallIssue]
     except InputError:
         return load(filename)

@@ -102,9 +102,11 @@ class Picture:
         """
         draw = RENDERERS[renderer]
         lit = self.lit()
-        with resized(pick_sensor(lit.mi_scene, sensor), size) as camera:
-            with draw(self, lit, camera, spp, samples) as image:
-                yield image
+        with (
+            resized(pick_sensor(lit.mi_scene, sensor), size) as camera,
+            draw(self, lit, camera, spp, samples) as image,
+        ):
+            yield image
 
 
 @RENDERERS.add("mitsuba")

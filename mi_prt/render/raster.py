@@ -193,12 +193,15 @@ class _Part:
 
 
 def _check_surfaces(scene, points):
-    if [s.kind for s in scene.surfaces] != [s["kind"] for s in points.surfaces]:
+    known = len(points.surfaces)
+    added = [s.name for s in scene.surfaces[known:]]
+    unlike = [s.kind for s in scene.surfaces[:known]] != [s["kind"] for s in points.surfaces]
+    if unlike or not all(s.shape.is_emitter() for s in scene.surfaces[known:]):
         raise SceneError(
             "the scene's shapes are not those of the asset: pass the scene that it was precomputed"
             " from"
         )
-    bare = [s["name"] for s in points.surfaces if not s["patches"]]
+    bare = [s["name"] for s in points.surfaces if not s["patches"]] + added
     if bare:
         warnings.warn(
             f"the raster renderer leaves out shapes without points: {', '.join(bare)}", stacklevel=3
@@ -275,7 +278,7 @@ def _shading(scene, points):
     emission = np.zeros((len(points), 3), np.float32)
     flags = (_backs(points) > 0) + 2 * np.array([s["kind"] != "mesh" for s in points.surfaces])
     albedo = np.hstack([points.albedo, flags[points.surface, None]]).astype(np.float32)
-    for i, surface in enumerate(scene.surfaces):
+    for i, surface in enumerate(scene.surfaces[: len(points.surfaces)]):
         if surface.shape.emitter() is None or not points.surfaces[i]["patches"]:
             continue
         own = np.flatnonzero(points.surface == i)

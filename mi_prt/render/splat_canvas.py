@@ -5,7 +5,7 @@ Importing this module opens OpenGL.
 
 import numpy as np
 
-from .canvas import GL, SHADERS, ShaderProgramCache, make_current
+from .canvas import GL, SHADERS, ShaderProgramCache, make_current  # pyright: ignore[reportAttributeAccessIssue]
 
 
 class SplatCanvas:
@@ -44,7 +44,7 @@ class SplatCanvas:
             GL.GL_DEPTH_COMPONENT32F, width, height, GL.GL_DEPTH_COMPONENT, depth
         )
         self._weighted = _texture(GL.GL_RGBA32F, width, height, GL.GL_RGBA)
-        self._radiance = _texture(GL.GL_RGBA32F, *self._size, GL.GL_RGBA)
+        self._radiance = _texture(GL.GL_RGBA32F, *self._size, GL.GL_RGBA)  # pyright: ignore[reportCallIssue]
         self._sums = _framebuffer(
             {GL.GL_COLOR_ATTACHMENT0: self._weighted, GL.GL_DEPTH_ATTACHMENT: self._depth}
         )

@@ -4,6 +4,7 @@ The rest is named, not dropped in silence.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -30,8 +31,8 @@ class Material:
         What is not modelled, for example "conductor: all of its reflection".
     """
 
-    bsdf: object
-    modelled: object
+    bsdf: Any
+    modelled: Any
     two_sided: bool
     textured: bool
     left_out: tuple
@@ -112,8 +113,8 @@ class Facing:
     geometric, shading : mi.Normal3f
     """
 
-    geometric: object
-    shading: object
+    geometric: Any
+    shading: Any
 
 
 def facing(si, ray, surfaces):

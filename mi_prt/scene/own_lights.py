@@ -4,6 +4,7 @@ import hashlib
 import re
 from collections import Counter
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -33,8 +34,8 @@ class OwnLight:
     """
 
     name: str
-    emitter: object
-    shape: object
+    emitter: Any
+    shape: Any
     is_distant: bool
 
     @property

@@ -3,6 +3,7 @@
 import re
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -30,8 +31,8 @@ class Surface:
     """
 
     name: str
-    shape: object
-    instance: object
+    shape: Any
+    instance: Any
     to_world: np.ndarray
     material: Material
 

@@ -46,4 +46,4 @@ def _registry_id(node):
     import drjit as dr
 
     mi = mitsuba()
-    return 0 if node is None else int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(node))[0])
+    return 0 if node is None else int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(node))[0])  # pyright: ignore[reportIndexIssue]

@@ -48,6 +48,7 @@ def digest_of(nodes, keep=lambda key: True):
         # SceneParameters iterates over pairs
         for key in sorted(key for key in parameters.keys() if keep(key)):
             value = parameters[key]
-            value = value.matrix if hasattr(value, "matrix") else value
+            # Asked by type: Dr.Jit reads `matrix` of a vector as a swizzle of its components.
+            value = value.matrix if "Transform" in type(value).__name__ else value
             digest.update(key.encode() + np.ascontiguousarray(np.array(value)).tobytes())
     return digest.hexdigest()

@@ -27,13 +27,15 @@ import json
 from mi_prt.system import runtime
 mi = runtime.mitsuba()
 import drjit as dr
-scene = mi.load_dict({"type": "scene", "integrator": {"type": "path"}, "light": {"type": "constant"},
-                      "sphere": {"type": "sphere"}, "sensor": {"type": "perspective", "film": {
-                          "type": "hdrfilm", "width": 4, "height": 4}}})
+film = {"type": "hdrfilm", "width": 4, "height": 4}
+scene = mi.load_dict({"type": "scene", "integrator": {"type": "path"},
+                      "light": {"type": "constant"}, "sphere": {"type": "sphere"},
+                      "sensor": {"type": "perspective", "film": film}})
 hit = scene.ray_intersect(mi.Ray3f([0, 0, 5], [0, 0, -1]))
 mi.render(scene, spp=1).numpy()
-print(json.dumps({"variant": mi.variant(), "distance": float(hit.t[0]), "threads": runtime.thread_count(),
-                  "embree": bool(mi.MI_ENABLE_EMBREE), "gpu": bool(dr.has_backend(dr.JitBackend.CUDA)),
+print(json.dumps({"variant": mi.variant(), "distance": float(hit.t[0]),
+                  "threads": runtime.thread_count(), "embree": bool(mi.MI_ENABLE_EMBREE),
+                  "gpu": bool(dr.has_backend(dr.JitBackend.CUDA)),
                   "llvm": runtime.versions()["llvm"]}))
 """
 
@@ -47,7 +49,8 @@ driver = glGetString(GL_RENDERER).decode()
 scene = pyrender.Scene(bg_color=[1.0, 1.0, 1.0, 1.0])
 scene.add(pyrender.PerspectiveCamera(yfov=1.0))
 color, _ = renderer.render(scene)
-print(json.dumps({"platform": runtime.raster_platform(), "driver": driver, "background": int(color.min())}))
+print(json.dumps({"platform": runtime.raster_platform(), "driver": driver,
+                  "background": int(color.min())}))
 """
 
 

@@ -1,5 +1,7 @@
 """How much memory there is, and how much a run may take."""
 
+from pathlib import Path
+
 import psutil
 
 from ..errors import SettingsError
@@ -52,7 +54,9 @@ def free_bytes():
     free = psutil.virtual_memory().available
     for folder, names in _control_groups():
         try:
-            limit, used, statistics = (open(folder + name).read().split() for name in names[:3])
+            limit, used, statistics = (
+                Path(folder + name).read_text().split() for name in names[:3]
+            )
         except OSError:
             continue
         if limit != ["max"]:
@@ -68,7 +72,7 @@ def _control_groups():
     container sees it.
     """
     try:
-        lines = open("/proc/self/cgroup").read().splitlines()
+        lines = Path("/proc/self/cgroup").read_text().splitlines()
     except OSError:
         return
     for _, controllers, group in (line.split(":", 2) for line in lines):

@@ -8,6 +8,7 @@ names a module, which registers when it is imported).
 import importlib
 import importlib.metadata
 import pkgutil
+import reprlib
 from collections.abc import Mapping
 
 from ..errors import SettingsError
@@ -29,7 +30,7 @@ class Registry(Mapping):
         Raised for an unknown name, an `InputError`.
     """
 
-    def __init__(self, what, package, error=SettingsError):
+    def __init__(self, what, package, error: type[Exception] = SettingsError):
         self._what, self._package, self._error = what, package, error
         self._kinds, self._complete = {}, False
 
@@ -49,6 +50,10 @@ class Registry(Mapping):
 
         return register
 
+    def restore(self, kinds):
+        """Hold these kinds, a dict by name, and no others; for tests of what is registered."""
+        self._kinds = dict(kinds)
+
     def __getitem__(self, name):
         """The kind of a name.
 
@@ -59,7 +64,8 @@ class Registry(Mapping):
         """
         self._import()
         if not isinstance(name, str) or name not in self._kinds:
-            raise self._error(f"{self._what} '{name}' is not known: use {', '.join(self._kinds)}")
+            shown = reprlib.repr(name)  # of a hostile file: any text
+            raise self._error(f"{self._what} {shown} is not known: use {', '.join(self._kinds)}")
         return self._kinds[name]
 
     def __contains__(self, name):

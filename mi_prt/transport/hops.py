@@ -9,6 +9,7 @@ up to the whole hemisphere: a white furnace is white without noise.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import scipy.sparse
@@ -40,7 +41,7 @@ class Hops:
         Which of the rays of each point are used.
     """
 
-    rays: object
+    rays: Any
     blocked: np.ndarray
     first: int = 0
     stride: int = 1

@@ -10,13 +10,13 @@ from ..directions.hemisphere import Hemisphere
 from ..lighting.emission import emission_of
 from ..points.clusters import Clusters
 from ..system.parallel import one_blas_thread
-from ..system.schema import Anything, Flag, MapOf, Number, Record, Text
+from ..system.schema import Flag, Number, Record, Text
 from .depth import DepthBuffers
 from .ledger import Entry
 from .local_direct import LocalDirect
 from .local_storage import DEPTH_SHAPES, pack_depth, pack_transfer, transfer_shapes, unpack
 from .transfer_matrix import Transfer
-from .transport import TRANSPORTS, Transport
+from .transport import CHANNELS, TRANSPORTS, Transport, report_spec
 
 
 @TRANSPORTS.register
@@ -128,7 +128,7 @@ class LocalTransport(Transport):
             "quantize": self.quantize,
             "extent": float(self.depth.extent),
             "reflects": self.reflects,
-            "channels": self.transfer.matrix.shape[3] if self.reflects else 1,
+            "channels": self.transfer.matrix.shape[3] if self.reflects else 1,  # pyright: ignore[reportOptionalMemberAccess]
             "sparse": "transfer/columns" in self.arrays(),
             "report": self.report,
         }
@@ -141,9 +141,11 @@ class LocalTransport(Transport):
                 "quantize": Text("16", "none"),
                 "extent": Number(1e-30, 1e30),
                 "reflects": Flag(),
-                "channels": Number(1, 3, whole=True),
+                "channels": CHANNELS,
                 "sparse": Flag(),
-                "report": MapOf(Anything()),
+                "report": report_spec(
+                    ("misclassified_visibility",), ("direct_error", "transfer_error")
+                ),
             }
         )
 
