@@ -67,8 +67,8 @@ class Asset:
         rotate : (axis, degrees), optional
             Turns the distant light.
         scene : Scene, path, dict or mi.Scene, optional
-            Needed where the light contains distant light of the scene, and only then opened; by
-            default where it was.
+            Needed where the light contains distant light of the scene, or lamps of which the asset
+            holds no transport of their own, and only then opened; by default where it was.
 
         Returns
         -------
@@ -88,6 +88,8 @@ class Asset:
         names = {emitter["name"]: emitter["distant"] for emitter in self.emitters}
         opened = scene if scene_is_open(scene) else lambda: open_scene_of(self, scene)
         light = resolve(light, opened, names)
+        if any(map(self._needs_place, light.parts)):
+            light = resolve(light, open_scene_of(self, scene), names)
         if rotate is None:
             return light
         if light.distant.is_empty:
@@ -96,6 +98,17 @@ class Asset:
                 " (--rotate)"
             )
         return light.rotated(*rotate)
+
+    def _needs_place(self, part):
+        """Whether only transport answers for a part that must know where it shines, and the part
+        does not.
+        """
+        transports = self.transports.values()
+        return (
+            not part.is_placed
+            and not any(t.takes(part) for t in transports)
+            and any(t.stands_in_for(part) for t in transports)
+        )
 
     def _own_light(self):
         """The scene's own light, as far as the asset holds it."""
