@@ -20,7 +20,7 @@ demo: $(stamp)
 check: $(stamp)
 	$(venv)/bin/ruff format --check .
 	$(venv)/bin/ruff check .
-	$(venv)/bin/pyright --pythonpath $(python)
+	$(venv)/bin/basedpyright --pythonpath $(python)
 
 # Two processes: Mitsuba and BLAS use all cores inside each, and what is left idle by one the other takes.
 test: $(stamp)

@@ -19,12 +19,11 @@ from pathlib import Path
 
 import matplotlib
 import numpy as np
-from mi_prt.basis.bases import fit_basis
-from mi_prt.precompute.info import storage_bytes
 from page import ROOT, saved, write_page
 
 import mi_prt
 from mi_prt import LightWarning
+from mi_prt.basis.basis import BASES
 from mi_prt.basis.rows import Rows
 from mi_prt.basis.target import Target
 from mi_prt.directions import Cubemap
@@ -40,6 +39,7 @@ from mi_prt.render.image import coverage, pick_sensor, render_image, resized
 from mi_prt.scene.scene import open_scene
 from mi_prt.system.runtime import mitsuba
 from mi_prt.transport.bits import sample_direct
+from mi_prt.transport.distant import storage_bytes
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -107,7 +107,7 @@ class Sampled:
         self.rows = Rows(self.transport.rows, self.index, DIRECTIONS)
 
     def fit(self, kind, components):
-        return fit_basis(kind, self.rows, Target(components))
+        return BASES[kind].fit(self.rows, Target(components))
 
 
 def residuals(fit, components):
@@ -189,7 +189,7 @@ def transport_error(assets, pictures):
         yield "|---|" + "---:|" * len(COUNTS)
         for kind, name in NAMES.items():
             yield f"| {name} | " + " | ".join(f"{error:.3f}" for error in errors[kind]) + " |"
-            size = np.array([sum(storage_bytes(kind, n, s, d)) for d in COUNTS]) / 1e6
+            size = np.array([sum(storage_bytes(BASES[kind], n, s, d)) for d in COUNTS]) / 1e6
             row[0].plot(COUNTS, errors[kind], ".-", color=COLOURS[kind], label=name)
             row[1].plot(size, errors[kind], ".-", color=COLOURS[kind])
             if kind != "pca":
@@ -225,7 +225,7 @@ def _crossing(mesh, name, kind, fits, errors, n, s):
     below = counts[_from_then_on(other < np.interp(counts, every, pca) - 1e-6)]
     by_count = f"from {below[0]} coefficients" if len(below) else f"never up to {counts[-1]}"
     sizes = [
-        np.array([sum(storage_bytes(k, n, s, int(d))) for d in c]) / 1e6
+        np.array([sum(storage_bytes(BASES[k], n, s, int(d))) for d in c]) / 1e6
         for k, c in ((kind, counts), ("pca", every))
     ]
     inside = (sizes[0] >= sizes[1][0]) & (sizes[0] <= sizes[1][-1])
@@ -340,10 +340,11 @@ def shading(assets, pictures):
                 reference.mean[covered]
             )
             flip, _ = metrics.flip(display(picture, factor), display(reference.mean, factor))
+            held = asset.transports["distant"]
             name = f"{kind} {components}" if components else "none (all directions)"
             yield (
-                f"| {name} | {asset.report['captured_variance']:.2%} |"
-                f" {asset.report['relative_error']:.3f} | {_beyond(irradiance, at_points):.2%} |"
+                f"| {name} | {held.report['captured_variance']:.2%} |"
+                f" {held.report['relative_error']:.3f} | {_beyond(irradiance, at_points):.2%} |"
                 f" {metrics.relative_bias(irradiance, at_points.mean):+.2%} |"
                 f" {np.sqrt(max(rmse**2 - noise**2, 0)):.2%} | {flip:.3f} |"
             )
@@ -476,16 +477,17 @@ def memory_table(assets, pictures):
                 },
                 output=Path(folder) / f"{mesh}.prt",
             )
-            storage = mi_prt.precompute.info.describe_asset(asset)["storage"]
+            file = asset.path.stat().st_size
+            storage = asset.transports["distant"].summary()["storage"]
             predicted, measured = storage["predicted"], storage["measured"]
             figures = [
                 predicted["relighting"],
                 measured["coefficients"],
                 predicted["projection"],
                 measured["basis"],
-                measured["file"],
+                file,
             ]
-            ratio = predicted["relighting"] / measured["file"]
+            ratio = predicted["relighting"] / file
             yield (
                 f"| {mesh} | {len(asset.points):,} | "
                 + " | ".join(f"{x / 1e6:.2f}" for x in figures)

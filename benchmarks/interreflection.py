@@ -145,7 +145,7 @@ def noise(assets, pictures):
 
     def reflected(**more):
         asset = mi_prt.precompute(path, **settings | more)
-        return asset, (asset.coefficients - direct.coefficients[:, None])[kept]
+        return asset, (_distant(asset).coefficients - _distant(direct).coefficients[:, None])[kept]
 
     _, exact = reflected(paths_per_point=8192, denoise=False)
     size = np.linalg.norm(exact)
@@ -156,15 +156,15 @@ def noise(assets, pictures):
             filtered, clean = reflected(indirect=way, paths_per_point=rays)
             plain.append(np.linalg.norm(noisy - exact) / size)
             estimate = (
-                asset.report["indirect_noise"]
-                * np.linalg.norm(direct.coefficients[kept])
+                _distant(asset).report["indirect_noise"]
+                * np.linalg.norm(_distant(direct).coefficients[kept])
                 * 3**0.5
                 / size
             )
             yield (
                 f"| `{way}` | {rays:,} | {plain[-1]:.2%} | {estimate:.2%} |"
                 f" {np.linalg.norm(clean - exact) / size:.2%} |"
-                f" {filtered.report['indirect_noise_passed']:.0%} |"
+                f" {_distant(filtered).report['indirect_noise_passed']:.0%} |"
             )
         slope = np.polyfit(np.log(RAYS), np.log(plain), 1)[0]
         yield f"| `{way}` | slope | N^{slope:.2f} | | | |"
@@ -194,13 +194,15 @@ def bounces(assets, pictures):
         assets / "scenes" / name / "scene.xml" for name in INTERIORS
     ]
     for path in paths:
-        asset = mi_prt.precompute(path, directions="cubemap:16", coefficients=16)
-        energy = [f"{x:.2g}" for x in asset.report["bounce_energy"][:6]] + [""] * 6
+        asset = mi_prt.precompute(
+            path, transports="distant", directions="cubemap:16", coefficients=16
+        )
+        energy = [f"{x:.2g}" for x in _distant(asset).report["bounce_energy"][:6]] + [""] * 6
         name = path.stem if path.stem != "scene" else path.parent.name
-        left = asset.report.get("bounce_energy_left") or 0.0
+        left = _distant(asset).report.get("bounce_energy_left") or 0.0
         yield (
             f"| {name} | {len(asset.points):,} | {' | '.join(energy[:6])} |"
-            f" {asset.report['bounces']} | {left:.1g} |"
+            f" {_distant(asset).report['bounces']} | {left:.1g} |"
         )
 
 
@@ -235,7 +237,7 @@ def furnace(assets, pictures):
         radiance = asset.relight(mi_prt.EnvironmentMap(np.ones((2, 4, 3), np.float32)))[
             ~asset.buried
         ]
-        direct = asset.report["bounce_energy"][0]
+        direct = _distant(asset).report["bounce_energy"][0]
         off = asset.points.report["dipping_hemispheres"]
         yield (
             f"| {name} on a plane | {len(asset.points):,} | {off:,} | {direct:.3f} |"
@@ -257,7 +259,7 @@ def speed(assets, pictures):
     stages = ", ".join(f"{name} {value:.1f}" for name, value in cost["seconds"].items())
     yield (
         f"{len(asset.points):,} points, `cubemap:32` with 4 rays in each cell, 512 coefficients,"
-        f" {BOUNCES} reflections, albedo 0.5, {asset.report['paths_per_point']} rays for"
+        f" {BOUNCES} reflections, albedo 0.5, {_distant(asset).report['paths_per_point']} rays for"
         f" reflections from each point (`auto`): **{seconds:.1f} s** ({stages}); direct light alone"
         f" {direct_seconds:.1f} s, ratio {seconds / direct_seconds:.2f}.\n"
     )
@@ -295,7 +297,7 @@ def _against_mitsuba(scene, asset, seconds):
         spent += time.perf_counter() - started
         errors.append(truth.noise)
     noise = float(np.median(errors))
-    wanted = asset.report["indirect_noise"]
+    wanted = _distant(asset).report["indirect_noise"]
     factor = (noise / wanted) ** 2
     total = spent / len(few) * len(directions)
     yield (
@@ -322,9 +324,10 @@ def cornell(assets, pictures):
     shown = np.concatenate([display(x, factor) for x in (direct, ours, truth)], axis=1)
     Image.fromarray((shown * 255 + 0.5).astype("uint8")).save(pictures / "cornell.png")
     yield (
-        f"Left: direct light alone. Middle: mi_prt, 256 coefficients, {asset.report['bounces']}"
-        f" reflections (`auto`), precomputed in {sum(cost['seconds'].values()):.0f} s and relit in"
-        " milliseconds. Right: Mitsuba's `path` without a limit of depth, 2,048 samples per pixel."
+        "Left: direct light alone. Middle: mi_prt, 256 coefficients,"
+        f" {_distant(asset).report['bounces']} reflections (`auto`), precomputed in"
+        f" {sum(cost['seconds'].values()):.0f} s and relit in milliseconds."
+        " Right: Mitsuba's `path` without a limit of depth, 2,048 samples per pixel."
         f" Relative RMSE {metrics.relative_rmse(ours, truth):.1%}, bias"
         f" {metrics.relative_bias(ours, truth):+.2%} (of direct light alone"
         f" {metrics.relative_rmse(direct, truth):.0%} and"
@@ -344,6 +347,11 @@ SECTIONS = {
 
 
 # --- helpers --------------------------------------------------------------------------------------
+
+
+def _distant(asset):
+    """The asset's transport of distant light."""
+    return asset.transports["distant"]
 
 
 def _some(asset, count=COMPARED):

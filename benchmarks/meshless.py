@@ -21,7 +21,6 @@ from pathlib import Path
 from unittest import mock
 
 import numpy as np
-from mi_prt.asset.meshless_file import compressed
 from page import plt, saved, write_page
 from scipy.spatial import cKDTree
 
@@ -34,11 +33,12 @@ from mi_prt.lighting.light import as_light
 from mi_prt.lighting.to_mitsuba import lit_scene
 from mi_prt.points.particles import cross_surfaces, free_places, trace_particles
 from mi_prt.points.points import sample_points
+from mi_prt.points.sample_locator import SampleLocator
 from mi_prt.points.samples import COVERED
 from mi_prt.points.thinning import embedded
-from mi_prt.precompute import meshless as meshless_run
+from mi_prt.precompute import examples as example_lights
 from mi_prt.precompute.precompute import measure
-from mi_prt.precompute.settings import MeshlessSettings
+from mi_prt.precompute.settings import Settings
 from mi_prt.scene.scene import mesh_arrays, open_scene
 from mi_prt.system.runtime import count_kernels, mitsuba
 from mi_prt.transport import local_direct
@@ -53,7 +53,8 @@ CHECKED = SCENES[:2]  # where the truth of reflected light is told by Mitsuba's 
 MIDDLE = (0.1, 1.5, 0.3)  # of the Cornell box
 BOX_FACES = 12
 TOTAL_FLUX = 4 * np.pi  # W of a point light of 1 W/sr
-DEFAULTS = MeshlessSettings()
+DEFAULTS = Settings()
+LOCAL = {"points": "samples", "transports": "local"}  # of all precomputations here
 
 
 @dataclass(frozen=True)
@@ -133,27 +134,27 @@ def samples(assets, pictures):
     for name, panel in zip(SCENES, panels):
         path = _path(assets, name)
         (asset, _), scene = _precomputed(path), _scene(path)
-        sampled, points = asset.samples, asset.points
-        radii, correlation = _pair_correlation(scene, sampled)
+        points, clusters = asset.points, asset.transports["local"].clusters
+        radii, correlation = _pair_correlation(scene, points)
         axes[0].plot(radii, correlation, label=name)
         found = trace_particles(scene, 1, LIGHT_SEED)[0]
-        found = found.at(np.random.default_rng(0).permutation(len(found))[: len(sampled)])
-        distance = np.sort(_distances(sampled, found))
+        found = found.at(np.random.default_rng(0).permutation(len(found))[: len(points)])
+        distance = np.sort(_distances(points, found))
         axes[1].plot(distance, np.arange(1, len(distance) + 1) / len(distance), label=name)
-        report, sizes = points.report, np.diff(sampled.starts)
+        report, sizes = points.report, np.diff(clusters.starts)
         exact = _cornell_area(scene) if name == "cornell-box" else None
-        roots = np.repeat(sampled.roots, sizes)
+        roots = np.repeat(clusters.roots, sizes)
         widest = np.degrees(
             np.arccos(np.clip((points.normals * points.normals[roots]).sum(axis=1), -1, 1))
         ).max()
         yield (
-            f"| {name} | {len(sampled):,} | {sampled.radius:.4f} | {report['coverage']:.1%} |"
+            f"| {name} | {len(points):,} | {points.layout.radius:.4f} | {report['coverage']:.1%} |"
             f" {(distance < 1).mean():.1%} | {report['reachable_area']:.2f} | "
             + (f"{exact:.2f} | {report['reachable_area'] / exact - 1:+.2%}" if exact else " | ")
             + f" | {sample_points(scene).areas.sum(dtype=np.float64):.2f} | {len(sizes)} |"
             f" {sizes.min()} / {np.median(sizes):.0f} / {sizes.max()} | {widest:.0f}° |"
         )
-        _draw_clusters(panel, sampled, name)
+        _draw_clusters(panel, points, clusters, name)
     axes[0].axhline(1, color="grey", lw=0.8)
     axes[0].set(
         xlabel="distance / radius",
@@ -302,7 +303,7 @@ def extremes(assets, pictures):
         " other, where there should be none.\n\n| distance from the wall, m | direct flux in its"
         " own half | leak, direct | leak, indirect |\n|---:|---:|---:|---:|"
     )
-    room = mi_prt.precompute(_divided_room(), points="samples", **effort.settings)
+    room = mi_prt.precompute(_divided_room(), **LOCAL, **effort.settings)
     beyond = room.points.positions[:, 0] < 0
     for distance in (0.5, 0.1, 0.01, 1e-3, 0.0):
         light = mi_prt.PointLight((0.005 + distance, 0.1, 0.2), 1.0)
@@ -339,7 +340,7 @@ def trade(assets, pictures, names=SCENES[:1]):
         )
         path, curves = _path(assets, name), {}
         # compiles
-        measure(path, points="samples", **effort.trade | {"count": 1000, "cluster_size": 200})
+        measure(path, **LOCAL, **effort.trade | {"count": 1000, "cluster_size": 200})
         for setting, values in _trade_values().items():
             for value in values:
                 row = _trade_row(path, _variant(setting, value))
@@ -370,15 +371,16 @@ def speed(assets, pictures):
         size = file.stat().st_size
         loaded = mi_prt.load(file)
     yield (
-        f"Cornell box, {len(asset.points):,} samples in {len(asset.samples.roots)} clusters,"
-        f" precomputed in **{sum(seconds.values()):.0f} s** (asked: ≤ 120 s; the paper: 4 hours):"
+        f"Cornell box, {len(asset.points):,} samples in"
+        f" {len(asset.transports['local'].clusters)} clusters, precomputed in"
+        f" **{sum(seconds.values()):.0f} s** (asked: ≤ 120 s; the paper: 4 hours):"
         f" {', '.join(f'{stage} {value:.1f}' for stage, value in seconds.items())}."
         f" {cost['rays'] / 1e6:.0f} million rays fill the depth buffers;"
         f" {cost['peak_memory_bytes'] / 1e9:.1f} GB of memory at most. File: **{size / 1e6:.1f}"
         " MB** (asked: ≤ 30 MB).\n"
     )
     yield "| stored | MB | share |\n|---|---:|---:|"
-    stored = {name: array.nbytes for name, array in compressed(asset).items()}
+    stored = {name: array.nbytes for name, array in _stored(asset).items()}
     for group in sorted(
         {name.split("_scale")[0] for name in stored}, key=lambda g: -_group_bytes(stored, g)
     ):
@@ -417,7 +419,7 @@ def _scene(path):
 @cache
 def _precomputed(path):
     """The asset with the default settings, and its cost."""
-    return measure(path, points="samples", **effort.settings)
+    return measure(path, **LOCAL, **effort.settings)
 
 
 @cache
@@ -635,36 +637,34 @@ def _against_path(path, asset, name, lights):
 # --- samples --------------------------------------------------------------------------------------
 
 
-def _distances(sampled, places):
+def _distances(points, places):
     """Of places from the nearest sample, in radii and in the metric of thinning."""
-    radius = sampled.radius
-    tree = cKDTree(embedded(sampled.points.positions, sampled.points.normals, radius))
+    radius = points.layout.radius
+    tree = cKDTree(embedded(points.positions, points.normals, radius))
     return tree.query(embedded(places.positions, places.normals, radius), workers=-1)[0] / radius
 
 
-def _pair_correlation(scene, sampled):
+def _pair_correlation(scene, points):
     """Pairs of samples over pairs of random places on the same surface, by distance in radii."""
-    points, edges = sampled.points, np.linspace(0, 4, 61)
+    radius, edges = points.layout.radius, np.linspace(0, 4, 61)
     low, high = points.positions.min(axis=0), points.positions.max(axis=0)
     positions, normals, count = [], [], 0
     for crossings, _ in cross_surfaces(
         scene, (low + high) / 2, np.linalg.norm(high - low) / 2, LIGHT_SEED
     ):
-        reachable = crossings.at(_distances(sampled, crossings) < COVERED)
+        reachable = crossings.at(_distances(points, crossings) < COVERED)
         positions.append(reachable.positions), normals.append(reachable.normals)
         count += len(reachable)
-        if count >= len(sampled):
+        if count >= len(points):
             break
     pairs = []
     for where, facing in (
         (points.positions, points.normals),
         (np.concatenate(positions), np.concatenate(normals)),
     ):
-        first, second = (
-            cKDTree(where).query_pairs(edges[-1] * sampled.radius, output_type="ndarray").T
-        )
+        first, second = cKDTree(where).query_pairs(edges[-1] * radius, output_type="ndarray").T
         alike = (facing[first] * facing[second]).sum(axis=1) > 0.5
-        distance = np.linalg.norm(where[first] - where[second], axis=1)[alike] / sampled.radius
+        distance = np.linalg.norm(where[first] - where[second], axis=1)[alike] / radius
         pairs.append(np.histogram(distance, edges)[0] / len(where) ** 2)
     return (edges[1:] + edges[:-1]) / 2, pairs[0] / np.maximum(pairs[1], 1e-30)
 
@@ -689,9 +689,9 @@ def _cornell_area(scene):
     return total
 
 
-def _draw_clusters(axis, sampled, title):
+def _draw_clusters(axis, points, clusters, title):
     """Samples that face the viewer, in parallel projection, far ones first."""
-    points, sizes = sampled.points, np.diff(sampled.starts)
+    sizes = np.diff(clusters.starts)
     toward = np.array([0.45, 0.5, 0.75])
     toward /= np.linalg.norm(toward)
     right = np.cross([0, 1, 0], toward)
@@ -708,7 +708,7 @@ def _draw_clusters(axis, sampled, title):
         c=colours[shown],
         lw=0,
     )
-    roots = np.intersect1d(sampled.roots, shown)
+    roots = np.intersect1d(clusters.roots, shown)
     axis.scatter(
         points.positions[roots] @ right, points.positions[roots] @ up, s=8, c="black", lw=0
     )
@@ -746,13 +746,14 @@ class _TableDirect(LocalDirect):
 
     Parameters
     ----------
-    asset : MeshlessAsset
+    asset : Asset
     chosen : (m,) int
         Points; irradiance of others means nothing.
     """
 
     def __init__(self, asset, chosen):
-        super().__init__(asset.samples, asset.depth, _rotations(asset))
+        local = asset.transports["local"]
+        super().__init__(asset.points, local.clusters, local.depth)
         rows = np.zeros(len(asset.points), np.uint32)
         rows[chosen] = np.arange(len(chosen))
         self._rows = mitsuba().UInt32(rows)
@@ -789,15 +790,18 @@ TESTS = {
 
 def _encoding_tallies(path):
     (asset, _), scene = _precomputed(path), _scene(path)
-    sampled, hemisphere, extent = asset.samples, asset.depth.hemisphere, asset.depth.extent
+    local = asset.transports["local"]
+    hemisphere, extent, slices = local.depth.hemisphere, local.depth.extent, local.clusters.slices
     clusters = [
-        sampled.clusters[i]
-        for i in np.linspace(0, len(sampled.clusters) - 1, effort.encoded_clusters).astype(int)
+        slices[i] for i in np.linspace(0, len(slices) - 1, effort.encoded_clusters).astype(int)
     ]
     chosen = np.concatenate([np.arange(cluster.start, cluster.stop) for cluster in clusters])
-    rotations = _rotations(asset)
-    tracer = HemisphereTracer(scene, sampled, hemisphere, 1)
-    distances = [tracer.trace(cluster, rotations[cluster]).distance for cluster in clusters]
+    # Samples are in the order of their clusters.
+    normals = asset.points.normals
+    tracer = HemisphereTracer(scene, asset.points, local.clusters, hemisphere, 1)
+    distances = [
+        tracer.trace(cluster, cluster_frames(normals[cluster])).distance for cluster in clusters
+    ]
     points = asset.points.at(chosen)
     emissions, truths = [], []
     for place in _lights(path, effort.encoded_lights):
@@ -825,14 +829,8 @@ def _encoding_tallies(path):
     count("encoding", f"none: all {len(hemisphere):,} distances", table)
     for test, constants in TESTS.items():
         with mock.patch.multiple(local_direct, **{"SOFTNESS": local_direct.SOFTNESS} | constants):
-            count("test", test, LocalDirect(sampled, asset.depth, rotations))
+            count("test", test, LocalDirect(asset.points, local.clusters, local.depth))
     return tallies
-
-
-def _rotations(asset):
-    return np.concatenate(
-        [cluster_frames(asset.points.normals[cluster]) for cluster in asset.samples.clusters]
-    )
 
 
 def _encodings(extent):
@@ -982,7 +980,7 @@ def _furnace():
             "bsdf": _diffuse(albedo),
         }
         round_room, square_room = (
-            mi_prt.precompute(content, points="samples", **effort.furnace)
+            mi_prt.precompute(content, **LOCAL, **effort.furnace)
             for content in (sphere, {"type": "scene", "viewer": viewer, "room": room, "box": box})
         )
         cells = []
@@ -1055,8 +1053,8 @@ def _trade_row(path, changed):
 def _measured_trade(path, changed):
     settings = effort.trade | changed
     pca = settings.pop("pca", False)
-    with mock.patch.object(meshless_run, "fit_senders", _paper_senders if pca else fit_senders):
-        asset, cost = measure(path, points="samples", **settings)
+    with mock.patch.object(example_lights, "fit_senders", _paper_senders if pca else fit_senders):
+        asset, cost = measure(path, **LOCAL, **settings)
     lights = _lights(path, effort.trade_lights)
     judged, _ = _judged(path, asset, lights)
     row = {
@@ -1065,7 +1063,7 @@ def _measured_trade(path, changed):
     }
     row |= {
         "anywhere": float(np.median([_anywhere(path, asset, place) for place in lights])),
-        "bytes": sum(array.nbytes for array in compressed(asset).values()),
+        "bytes": sum(array.nbytes for array in _stored(asset).values()),
         "seconds": sum(cost["seconds"].values()),
         "relight": _relit_seconds(asset, [mi_prt.PointLight(place, 1.0) for place in lights]),
     }
@@ -1102,6 +1100,11 @@ def _places(path):
     )
 
 
+def _locator(asset):
+    points = asset.points
+    return SampleLocator(points.positions, points.normals, points.layout.radius)
+
+
 def _anywhere(path, asset, place):
     """Error of total light interpolated at places that are no samples."""
     mi = mitsuba()
@@ -1109,7 +1112,7 @@ def _anywhere(path, asset, place):
     direct, reflected = _truth(path, places, place)
     values = mi.Float(asset.irradiance(mi_prt.PointLight(place, 1.0)).ravel())
     where = mi.Point3f(places.positions.T), mi.Normal3f(places.normals.T)
-    result = np.array(asset.samples.locator().interpolated(values, *where)[0]).T
+    result = np.array(_locator(asset).interpolated(values, *where)[0]).T
     return _beyond_noise(result, Reference(direct + reflected.mean, reflected.standard_error))
 
 
@@ -1147,6 +1150,12 @@ def _draw_trade(curves, pictures, name):
 
 
 # --- speed ----------------------------------------------------------------------------------------
+
+
+def _stored(asset):
+    """Arrays of depth buffers and transfer as files have them."""
+    arrays = asset.transports["local"].arrays()
+    return {name: array for name, array in arrays.items() if not name.startswith("clusters")}
 
 
 def _group_bytes(stored, group):

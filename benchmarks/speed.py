@@ -18,7 +18,7 @@ from mi_prt.lighting.from_mitsuba import scene_light
 from mi_prt.points.points import sample_points
 from mi_prt.scene.scene import open_scene
 from mi_prt.system.runtime import count_kernels, thread_count
-from mi_prt.transport import direct
+from mi_prt.transport import bits
 
 SCENE = Path(__file__).resolve().parent.parent / "scenes" / "teapot.xml"
 
@@ -47,8 +47,8 @@ def sampling(scene, points, directions, repeat):
     """Transport sampling against `ray_test` alone on the same rays, already in memory."""
     import drjit as dr
 
-    tracer = direct.VisibilityTracer(scene, points, directions.vectors)
-    size = direct.LANES // tracer.lanes_per_point
+    tracer = bits.VisibilityTracer(scene, points, directions.vectors)
+    size = bits.LANES // tracer.lanes_per_point
     starts = [int(first) for first in np.linspace(0, len(points) - size, 8)]
     blocks = [(first, size) for first in starts]
     rays = [tracer.rays(*block) for block in blocks]
@@ -72,7 +72,7 @@ def sampling(scene, points, directions, repeat):
 
 def kernels(scene, points, directions):
     """Kernels compiled for many blocks, after one block."""
-    tracer = direct.VisibilityTracer(scene, points, directions.vectors)
+    tracer = bits.VisibilityTracer(scene, points, directions.vectors)
     list(tracer.stream([(0, 100)]))
     with count_kernels() as counted:
         list(tracer.stream((100 * block + 7, 90 + block) for block in range(10)))
@@ -86,12 +86,13 @@ def relighting(path, repeat):
     for bounces, bound in ((0, "≤ 2"), ("auto", "")):
         asset = mi_prt.precompute(path, coefficients=48, bounces=bounces)
         what = "direct light" if bounces == 0 else "with coloured reflections"
-        light = asset.project_light(scene_light(open_scene(path)))
+        transport = asset.transports["distant"]
+        light = transport.basis.project(scene_light(open_scene(path)), transport.directions)
         relit = [
-            _timed(lambda: asset.outgoing_radiance(asset.irradiance_from(*light)))
+            _timed(lambda: asset.outgoing_radiance(transport.total.respond(*light)))
             for _ in range(20 * repeat)
         ]
-        copied = [_timed(asset.coefficients.copy) for _ in range(20 * repeat)]
+        copied = [_timed(transport.coefficients.copy) for _ in range(20 * repeat)]
         _row(
             f"relight {len(asset.points):,} points, 48 coefficients, {what}, ms",
             f"{1e3 * np.median(relit):.2f}",

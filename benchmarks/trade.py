@@ -53,8 +53,9 @@ def main():
                 chosen = np.sort(np.random.default_rng(0).permutation(len(asset.points))[:2000])
                 at = asset.points.at(chosen)
                 truths = [irradiance(lit_scene(scene, light), at, 8192, 2048) for light in lights]
-            projected = [asset.project_light(light) for light in lights]
-            results = np.stack([asset.irradiance_from(*light)[chosen] for light in projected])
+            results = np.stack([asset.irradiance(light)[chosen] for light in lights])
+            transport = asset.transports["distant"]
+            projected = transport.basis.project(lights[0], transport.directions)
             expected = np.stack([truth.mean for truth in truths])
             noise = np.linalg.norm([truth.standard_error for truth in truths]) / np.linalg.norm(
                 expected
@@ -62,7 +63,7 @@ def main():
             error = np.sqrt(max(metrics.relative_rmse(results, expected) ** 2 - noise**2, 0))
             relight = np.median(
                 [
-                    _timed(lambda: asset.outgoing_radiance(asset.irradiance_from(*projected[0])))
+                    _timed(lambda: asset.outgoing_radiance(transport.total.respond(*projected)))
                     for _ in range(50)
                 ]
             )

@@ -8,13 +8,13 @@ import argparse
 import time
 from pathlib import Path
 
-from mi_prt.output.relight_local import animate_local
 from PIL import Image
 
 import mi_prt
 from mi_prt.lighting.from_mitsuba import scene_light
 from mi_prt.lighting.to_mitsuba import lit_scene
 from mi_prt.output.film import light_path
+from mi_prt.output.moving import animate
 from mi_prt.render.display import display, exposure
 from mi_prt.render.image import render_image, resized
 from mi_prt.scene.scene import open_scene
@@ -41,9 +41,10 @@ def main():
     say(f"1. precompute the transport of {SCENE.name} (once)")
     asset = mi_prt.precompute(SCENE, coefficients=128, rays_per_direction=4)
     asset.save(arguments.out / "still_life.prt")
+    found = asset.transports["distant"].report
     say(
-        f"   {len(asset.points):,} points, {asset.report['rays']:,} rays, {asset.report['bounces']}"
-        f" reflections, {asset.report['captured_variance']:.2%} of the variance"
+        f"   {len(asset.points):,} points, {found['rays']:,} rays, {found['bounces']} reflections,"
+        f" {found['captured_variance']:.2%} of the variance"
     )
 
     say("2. turn the sky around it")
@@ -106,17 +107,20 @@ def carried_lamp(path, frames):
     """
     begun = time.perf_counter()
     asset = mi_prt.precompute(
-        ROOM, points="samples", count=12_000, cluster_size=300, depth_directions=1024
+        ROOM,
+        points="samples",
+        transports="local",
+        count=12_000,
+        cluster_size=300,
+        depth_directions=1024,
     )
     say(
-        f"   {len(asset.points):,} samples, {len(asset.samples.roots)} clusters,"
+        f"   {len(asset.points):,} samples, {len(asset.transports['local'].clusters)} clusters,"
         f" {time.perf_counter() - begun:.1f} s"
     )
     way = light_path(WALK)
     lamp = mi_prt.PointLight(way.positions(1)[0], (3.2, 2.9, 2.5))
-    told = animate_local(
-        asset, path, way, frames, fps=12, light=lamp, size=(480, 300), renderer="raster"
-    )
+    told = animate(asset, path, way, frames, fps=12, light=lamp, size=(480, 300), renderer="raster")
     say(
         f"   direct light and all reflections: {1e3 * told['seconds']['relight'] / frames:.1f} ms a"
         " frame"

@@ -7,10 +7,9 @@ import argparse
 import time
 from pathlib import Path
 
-from mi_prt.output.relight_local import animate_local
-
 import mi_prt
 from mi_prt.output.film import light_path
+from mi_prt.output.moving import animate
 
 SCENE = Path(__file__).resolve().parent.parent / "scenes" / "room.xml"
 # through the doorway
@@ -33,19 +32,21 @@ def main():
 
     started = time.perf_counter()
     asset = mi_prt.precompute(
-        SCENE, points="samples", count=arguments.count, cluster_size=max(1, arguments.count // 45)
+        SCENE,
+        points="samples",
+        transports="local",
+        count=arguments.count,
+        cluster_size=max(1, arguments.count // 45),
     )
     asset.save(arguments.out / "room.prt")
     print(
-        f"{len(asset.points):,} samples in {len(asset.samples.roots)} clusters:"
+        f"{len(asset.points):,} samples in {len(asset.transports['local'].clusters)} clusters:"
         f" {time.perf_counter() - started:.0f} s"
     )
 
     lamp = mi_prt.PointLight(WALK.positions(1)[0], INTENSITY)
     film = arguments.out / "walk.mp4"
-    told = animate_local(
-        asset, film, WALK, arguments.frames, light=lamp, size=SIZE, renderer="raster"
-    )
+    told = animate(asset, film, WALK, arguments.frames, light=lamp, size=SIZE, renderer="raster")
     seconds = told["seconds"]
     print(
         f"{film}: relight {1e3 * seconds['relight'] / arguments.frames:.1f} ms, draw"

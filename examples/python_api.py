@@ -15,10 +15,12 @@ scene = {
     "ball": {"type": "sphere", "center": [0, 0, 0.4], "radius": 0.3},
 }
 asset = mi_prt.precompute(scene, directions="cubemap:16", coefficients=32)
+# An asset is points and transports: of distant light here, as the scene has no light of its own.
+distant = asset.transports["distant"]
 print(
-    f"{len(asset.points):,} points, {asset.directions}, captured variance"
-    f" {asset.report['captured_variance']:.3f}, {asset.report['bounces']} reflections: mean"
-    f" irradiance under a white sky {sum(asset.report['bounce_energy']):.3f} of π"
+    f"{len(asset.points):,} points, {distant.directions}, captured variance"
+    f" {distant.report['captured_variance']:.3f}, {distant.report['bounces']} reflections: mean"
+    f" irradiance under a white sky {sum(distant.report['bounce_energy']):.3f} of π"
 )
 
 # A map of any size: here a bright band of sky around the horizon (+y is up in a map; this scene has
@@ -31,9 +33,9 @@ light = mi_prt.EnvironmentMap(pixels).rotated(axis="x", degrees=90)
 irradiance = asset.irradiance(light)  # (n, 3) W/m²
 radiance = asset.relight(light)  # (n, 3) W/(m²·sr)
 # (1, 3, s), or (1, s) where all is grey: the first point's transport as the basis holds it
-row = asset.transport([0])
+row = distant.total.rows([0])
 print("mean irradiance", irradiance.mean(axis=0), "mean outgoing radiance", radiance.mean(axis=0))
-print("transport of point 0, integrated over the sphere:", row[0] @ asset.directions.solid_angles)
+print("transport of point 0, integrated over the sphere:", row[0] @ distant.directions.solid_angles)
 
 # Several lights at once: a list is their sum. A local light is seen right from outside the scene's
 # convex hull.

@@ -3,10 +3,11 @@
 Scenes are y-up, lengths in metres.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.stats
+from mutants import Parts
 
 from mi_prt.directions import parse_directions
 from mi_prt.points.points import sample_points
@@ -201,8 +202,11 @@ class SampledScene:
     points: object
     directions: object
     transport: object
-    buried: np.ndarray
     blocked: np.ndarray
+
+    @property
+    def buried(self):
+        return self.points.buried
 
     @property
     def kept(self):
@@ -224,14 +228,7 @@ class SampledScene:
 
     def hops(self, rays, seed=0, **rest):
         sampler = HopSampler(
-            self.scene,
-            self.points,
-            self.buried,
-            self.transport,
-            self.directions,
-            rays,
-            seed,
-            **rest,
+            self.scene, self.points, self.transport, self.directions, rays, seed, **rest
         )
         return Hops(np.concatenate(list(sampler.blocks())), self.blocked)
 
@@ -275,7 +272,33 @@ def sampled(parts, edge_length, directions="cubemap:16", rays_per_direction=1):
     opened = open_scene(parts)
     points, lattice = sample_points(opened, edge_length), parse_directions(directions)
     transport = sample_direct(opened, points, lattice, rays_per_direction)
-    buried = find_buried(opened, points, transport.dark())
+    points = replace(points, buried=find_buried(opened, points, transport.dark()))
     return SampledScene(
-        opened, points, lattice, transport, buried, blocked_share(transport, lattice.solid_angles)
+        opened, points, lattice, transport, blocked_share(transport, lattice.solid_angles)
     )
+
+
+def distant(asset):
+    """An asset's transport of light from afar."""
+    return asset.transports["distant"]
+
+
+# --- files ----------------------------------------------------------------------------------------
+
+
+def arrays_of(path):
+    """Arrays of an asset's file by name, read without mi_prt."""
+    parts = Parts.of(path.read_bytes())
+    return {name: array for name, (_, array) in parts.arrays().items()}
+
+
+def rewritten(source, path, change):
+    """The file `source` with what `change(header, arrays)` makes of the asset's header and of its
+    arrays by name, at `path`; places and shapes in the file are right.
+    """
+    parts = Parts.of(source.read_bytes())
+    codes = {name: code for name, (code, _) in parts.arrays().items()}
+    arrays = arrays_of(source)
+    change(parts.own, arrays)
+    path.write_bytes(parts.with_arrays({name: (codes[name], a) for name, a in arrays.items()}))
+    return path

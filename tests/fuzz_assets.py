@@ -26,13 +26,11 @@ import warnings
 from collections import Counter
 from pathlib import Path
 
-import numpy as np
-
 sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1])]
 
 from mutants import TURNS, Mutator, make_traps  # noqa: E402
 
-LOAD, RELIGHT = "mi_prt:load", "fuzz_assets:relight"
+LOAD, RELIGHT = "mi_prt:load", "small_assets:relight"
 FINE = ("refused", "loaded", "typed error")
 FAILURES = ("traceback", "crash", "hang", "memory", "foreign read", "message")
 TURN = 2000  # files for a worker, so that what caches grow by does not count
@@ -44,11 +42,6 @@ EVENTS = re.compile(
     r"|system|posix_spawn|spawn|fork|forkpty|startfile|putenv|kill)$|socket\.|subprocess\.|shutil\.|urllib\."
     r"|ftplib\.|http\.|smtplib\.|pickle\.find_class$|ctypes\.dlopen$|tempfile\."
 )
-
-
-def relight(asset):
-    """Once, with a map of radiance 1."""
-    asset.irradiance(np.ones((2, 4, 3), np.float32))
 
 
 class Watch:

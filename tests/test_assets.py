@@ -132,7 +132,7 @@ def made(request):
 
 @pytest.fixture(scope="session")
 def truths(made):
-    """Some points, and direct and indirect irradiance there by Mitsuba, by the name of the light."""
+    """Some points, and Mitsuba's direct and indirect irradiance there, by the light's name."""
     shown = np.flatnonzero(~made.asset.buried)
     chosen = np.sort(np.random.default_rng(1).permutation(shown)[:200])
     points, found = made.asset.points.at(chosen), {}

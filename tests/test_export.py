@@ -11,8 +11,9 @@ from conftest import cube, diffuse, rectangle, scene
 from PIL import Image
 
 from mi_prt.errors import SettingsError
-from mi_prt.output import export
+from mi_prt.output import npz, ply
 from mi_prt.points.points import sample_points
+from mi_prt.render import image_file
 from mi_prt.render.display import display, exposure
 from mi_prt.scene.scene import open_scene
 from mi_prt.system.runtime import mitsuba
@@ -61,12 +62,12 @@ def columns(vertex, names):
 
 def test_ply_holds_points_and_radiance(asset, radiance, tmp_path):
     path = tmp_path / "points.ply"
-    export.write_ply(path, asset, radiance)
+    ply.write_ply(path, asset, radiance)
     vertex, face = read_ply(path)
     np.testing.assert_array_equal(columns(vertex, "x y z"), asset.points.positions)
     np.testing.assert_array_equal(columns(vertex, "nx ny nz"), asset.points.normals)
     np.testing.assert_array_equal(columns(vertex, "radiance_r radiance_g radiance_b"), radiance)
-    np.testing.assert_array_equal(face, asset.points.patches.triangles())
+    np.testing.assert_array_equal(face, asset.points.layout.triangles())
     shown = display(radiance, exposure(radiance[~asset.buried]))
     np.testing.assert_allclose(
         columns(vertex, "red green blue") / 255, shown, atol=0.5 / 255 + 1e-6
@@ -79,7 +80,7 @@ def test_mitsuba_reads_the_ply(asset, radiance, tmp_path):
     """
     mi = mitsuba()
     path = tmp_path / "points.ply"
-    export.write_ply(path, asset, radiance)
+    ply.write_ply(path, asset, radiance)
     mesh = mi.load_dict({"type": "ply", "filename": str(path)})
     parameters = mi.traverse(mesh)
     np.testing.assert_array_equal(np.array(parameters["vertex_radiance_color"]), radiance.ravel())
@@ -90,14 +91,14 @@ def test_mitsuba_reads_the_ply(asset, radiance, tmp_path):
         np.array(parameters["vertex_normals"]), asset.points.normals.ravel()
     )
     np.testing.assert_array_equal(
-        np.array(parameters["faces"]), asset.points.patches.triangles().ravel()
+        np.array(parameters["faces"]), asset.points.layout.triangles().ravel()
     )
 
 
 def test_trimesh_reads_the_ply(asset, radiance, tmp_path):
     trimesh = pytest.importorskip("trimesh")
     path = tmp_path / "points.ply"
-    export.write_ply(path, asset, radiance)
+    ply.write_ply(path, asset, radiance)
     mesh = trimesh.load(path, process=False)
     vertex, face = read_ply(path)
     np.testing.assert_allclose(mesh.vertices, asset.points.positions)
@@ -111,14 +112,14 @@ def test_npz_holds_plain_arrays(asset, radiance, tmp_path):
     """NumPy reads it without pickles; the name is kept as it is."""
     path = tmp_path / "points.npz"
     irradiance = radiance * 2
-    export.write_npz(path, asset, radiance, irradiance)
+    npz.write_npz(path, asset, radiance, irradiance)
     points = asset.points
     expected = {
         "positions": points.positions,
         "normals": points.normals,
         "albedo": points.albedo,
         "areas": points.areas,
-        "triangles": points.patches.triangles(),
+        "triangles": points.layout.triangles(),
         "irradiance": irradiance,
         "radiance": radiance,
     }
@@ -134,7 +135,7 @@ def test_exr_keeps_every_bit(tmp_path):
     steps.
     """
     image = np.random.default_rng(0).normal(0, 1e5, (7, 11, 3)).astype(np.float32)
-    export.write_image(tmp_path / "image.EXR", image, factor=3.0)
+    image_file.write_image(tmp_path / "image.EXR", image, factor=3.0)
     with OpenEXR.File(str(tmp_path / "image.EXR")) as file:
         np.testing.assert_array_equal(file.channels()["RGB"].pixels, image)
 
@@ -144,12 +145,12 @@ def test_png_holds_displayed_values(tmp_path):
     first.
     """
     image = np.linspace(-0.1, 1.2, 3 * 4096).reshape(64, 64, 3)
-    export.write_image(tmp_path / "image.png", image / 4, factor=4.0)
+    image_file.write_image(tmp_path / "image.png", image / 4, factor=4.0)
     pixels = np.asarray(Image.open(tmp_path / "image.png"))
     assert pixels.dtype == np.uint8 and pixels.shape == image.shape
     np.testing.assert_allclose(pixels / 255, display(image, 1.0), atol=0.5 / 255 + 1e-6)
     assert len(np.unique(pixels)) == 256
-    export.write_displayed(tmp_path / "shown.png", display(image, 1.0))
+    image_file.write_displayed(tmp_path / "shown.png", display(image, 1.0))
     np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "shown.png")), pixels)
 
 
@@ -158,7 +159,7 @@ def test_a_failed_write_leaves_the_previous_file(asset, radiance, tmp_path, monk
     and nothing else.
     """
     path = tmp_path / "points.npz"
-    export.write_npz(path, asset, radiance, radiance)
+    npz.write_npz(path, asset, radiance, radiance)
     before = path.read_bytes()
 
     def full(error):
@@ -170,10 +171,10 @@ def test_a_failed_write_leaves_the_previous_file(asset, radiance, tmp_path, monk
 
     monkeypatch.setattr(np, "savez", full(OSError("No space left on device")))
     with pytest.raises(SettingsError, match="No space left"):
-        export.write_npz(path, asset, radiance, radiance)
+        npz.write_npz(path, asset, radiance, radiance)
     monkeypatch.setattr(np, "savez", full(KeyboardInterrupt()))
     with pytest.raises(KeyboardInterrupt):
-        export.write_npz(path, asset, radiance, radiance)
+        npz.write_npz(path, asset, radiance, radiance)
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["points.npz"]
 
@@ -181,14 +182,14 @@ def test_a_failed_write_leaves_the_previous_file(asset, radiance, tmp_path, monk
 def test_unusable_paths_are_refused(asset, radiance, tmp_path):
     image = np.zeros((2, 2, 3), np.float32)
     with pytest.raises(SettingsError, match=r"\.exr or \.png"):
-        export.write_image(tmp_path / "image.jpg", image)
+        image_file.write_image(tmp_path / "image.jpg", image)
     with pytest.raises(SettingsError, match=r"\.png"):
-        export.write_displayed(tmp_path / "image.exr", image)
+        image_file.write_displayed(tmp_path / "image.exr", image)
     for write in (
-        lambda path: export.write_image(path.with_suffix(".exr"), image),
-        lambda path: export.write_image(path.with_suffix(".png"), image),
-        lambda path: export.write_ply(path, asset, radiance),
-        lambda path: export.write_npz(path, asset, radiance, radiance),
+        lambda path: image_file.write_image(path.with_suffix(".exr"), image),
+        lambda path: image_file.write_image(path.with_suffix(".png"), image),
+        lambda path: ply.write_ply(path, asset, radiance),
+        lambda path: npz.write_npz(path, asset, radiance, radiance),
     ):
         with pytest.raises(SettingsError, match="create it first"):
             write(tmp_path / "missing" / "file")
@@ -200,5 +201,5 @@ def test_files_get_the_usual_permissions(tmp_path):
     file.
     """
     (tmp_path / "usual").touch()
-    export.write_image(tmp_path / "image.png", np.zeros((2, 2, 3)))
+    image_file.write_image(tmp_path / "image.png", np.zeros((2, 2, 3)))
     assert (tmp_path / "image.png").stat().st_mode == (tmp_path / "usual").stat().st_mode

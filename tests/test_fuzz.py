@@ -12,9 +12,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import small_assets
 from mutants import TURNS, Mutator
 
 from mi_prt.asset import container
+from mi_prt.basis.basis import BASES
 from mi_prt.errors import AssetError
 from mi_prt.system.schema import Array, ListOf, Number, OneOf, Record, Text, check
 
@@ -141,8 +143,16 @@ def good(tmp_path):
     return make(tmp_path / "good.prt", scene)
 
 
-def test_no_hostile_file_does_harm(good):
-    """3,200 mutants. Some of each kind must load, else the fuzzer would reach no deeper code."""
+@pytest.fixture(scope="session")
+def small(tmp_path_factory):
+    """Paths of the small assets by kind."""
+    return small_assets.make(tmp_path_factory.mktemp("small"))
+
+
+def test_no_hostile_container_does_harm(good):
+    """3,200 mutants of the file above. Some of each kind must load, else the fuzzer would reach no
+    deeper code.
+    """
     code, counts, failures, text = fuzz(
         good, "--count", 3200, "--load", "test_fuzz:load", "--relight", "test_fuzz:relight"
     )
@@ -151,6 +161,38 @@ def test_no_hostile_file_does_harm(good):
     assert {kind for kind, outcome in counts if outcome == "refused"} == {*TURNS, "bomb"}
     loaded = {kind: count for (kind, outcome), count in counts.items() if outcome == "loaded"}
     assert {"flipped", "own", "entry", "layout", "text"} <= loaded.keys(), text
+
+
+def test_no_hostile_file_does_harm(small):
+    """80 mutants of each small asset: loaded, relit, described, and looked up between points.
+
+    Some of each kind must load, else the fuzzer would reach no deeper code.
+    """
+    count = 80 * len(small)
+    code, counts, failures, text = fuzz(*small.values(), "--count", count, "--seconds", 120)
+    assert not failures and code == 0, text[-4000:]
+    assert sum(counts.values()) == count
+    assert {kind for kind, outcome in counts if outcome == "refused"} >= {*TURNS}
+    loaded = {kind: count for (kind, outcome), count in counts.items() if outcome == "loaded"}
+    assert {"flipped", "own", "entry", "layout"} <= loaded.keys(), text
+
+
+def test_small_assets_are_of_all_kinds(small):
+    """So that mutants reach each branch of the reader: all arrays that the format knows are
+    there.
+    """
+    names, headers = set(), []
+    for path in small.values():
+        with container.opened(path) as stored:
+            names.update(stored.names)
+            headers.append(stored.header)
+    assert len({h["points"]["layout"] for h in headers}) == 2
+    parts = [part for h in headers for part in h["transports"].items()]
+    assert {part["basis"] for kind, part in parts if kind == "distant"} == set(BASES)
+    assert {part["sparse"] for kind, part in parts if kind == "local"} == {True, False}
+    assert {part["quantize"] for kind, part in parts if kind != "distant"} == {"16", "none"}
+    for text in ("direct/coefficients", "transfer/matrix", "transfer/ends", "direct_scale"):
+        assert any(name.endswith(text) for name in names)
 
 
 def test_harm_is_noticed(good):

@@ -11,6 +11,7 @@ from conftest import bias, cube, diffuse, disk, facing, rectangle, relative_l2, 
 
 import mi_prt
 from mi_prt import AssetError, LightError, SceneError
+from mi_prt.render.image import render_image
 from mi_prt.render.integrator import integrator_for
 from mi_prt.system.runtime import mitsuba
 
@@ -232,9 +233,9 @@ def test_alpha_follows_mitsuba(path):
         np.testing.assert_allclose(image[..., 3][sure], reference[..., 3][sure], atol=1e-6)
 
 
-def test_area_lights_are_shown_and_light_nothing():
+def test_area_lights_are_shown_and_light_nothing_without_transport_for_them():
     """The shape of an area light shows its emission, as in Mitsuba, on top of what it reflects; its
-    light is left out.
+    light is left out where there is transport of distant light alone.
     """
     lamp = rectangle(
         (0, 0, 1),
@@ -245,7 +246,7 @@ def test_area_lights_are_shown_and_light_nothing():
     )
     parts = still_life(lamp=lamp)
     lit = mi.load_dict(parts)
-    asset = precompute(parts, "cubemap:8", edge_length=0.3)
+    asset = precompute(parts, "cubemap:8", edge_length=0.3, transports="distant")
     image, reference = render(lit, integrator_for(asset)), by_mitsuba(lit, 64)
     alone = mi.load_dict(still_life(floor=None, ball=None, lamp=lamp))
     on_lamp = inner(alone)
@@ -270,7 +271,7 @@ def test_hidden_area_lights_are_passed_through():
         (0, 0, 1), (0, 0.9, 1.5), 0.5, bsdf=diffuse(0.0), emitter={"type": "area", "radiance": 5.0}
     )
     parts = still_life(lamp=lamp)
-    asset = precompute(parts, edge_length=0.15)
+    asset = precompute(parts, edge_length=0.15, transports="distant")
     image = render(mi.load_dict(parts), with_hidden(asset))
     dark = mi.load_dict(still_life(lamp={k: v for k, v in lamp.items() if k != "emitter"}))
     reference = by_mitsuba(mi.load_dict(parts), 64, hide_emitters=True)
@@ -655,9 +656,32 @@ def test_one_integrator_renders_several_scenes(path):
     np.testing.assert_array_equal(render(day, integrator), first)
 
 
-def test_a_scene_without_distant_light_is_refused(path):
+def test_a_scene_without_light_that_the_asset_holds_is_refused(path):
+    """It holds distant light, and such transport does not stand in for lamps here."""
+    plugin = {"type": "prt", "filename": str(path)}
     lit = mi.load_dict(still_life(sky={"type": "point", "position": [0, 3, 0]}))
-    refused(LightError, "no distant light", render, lit, {"type": "prt", "filename": str(path)}, 1)
+    refused(LightError, "(lamp_1) this asset, with transports distant,", render, lit, plugin, 1)
+    dark = mi.load_dict(still_life(sky=None))
+    refused(LightError, "no light of its own", render, dark, plugin, 1)
+
+
+def test_lamps_with_and_without_transport(path):
+    """Beside the sky a lamp that the asset has transport for adds to the picture; one without does
+    not. Light is a sum, so that the first is the second and the lamp's own light.
+    """
+    bulb = {"type": "point", "position": [1, 2, 1], "intensity": {"type": "rgb", "value": 5.0}}
+    parts = still_life(bulb=bulb)
+    lit, sky = mi.load_dict(parts), mi.load_dict(still_life())
+    assert relative_l2(*(render(s, {"type": "prt", "filename": str(path)}) for s in (lit, sky))) < (
+        1e-5
+    )
+    both = precompute(parts, edge_length=0.12, rays_per_direction=4)
+    assert set(both.transports) == {"distant", "own"}
+    found, without = render(lit, integrator_for(both)), render(sky, integrator_for(both))
+    alone = render_image(both, lit, lit.sensors()[0], 16, irradiance=both.irradiance("scene:bulb"))
+    mask = inner(lit)
+    assert relative_l2(found[mask] - without[mask], alone[mask]) < 1e-4
+    compared(found, by_mitsuba(lit), 0.05, 0.02, mask=mask)
 
 
 def test_missing_and_broken_assets_are_refused(tmp_path):

@@ -5,16 +5,19 @@ Irradiance itself takes the place of coefficients in most tests (`conftest.Sampl
 has no part in them.
 """
 
-import h5py
+from itertools import pairwise
+
 import numpy as np
 import pytest
 import scipy.stats
 from conftest import (
     FALSE_POSITIVES,
     NOTHING,
+    arrays_of,
     bias,
     cube,
     diffuse,
+    distant,
     facing,
     largest_z,
     mesh,
@@ -156,7 +159,7 @@ def test_white_surfaces_under_a_white_sky_vanish(white_furnace):
         radiance.append(
             (direct + white_furnace.reflections(hops, direct, 1, bounces)[0])[:, 0] / np.pi
         )
-    for fewer, more in zip(radiance[:-2], radiance[1:-1]):
+    for fewer, more in pairwise(radiance[:-1]):
         assert (more >= fewer).all() and more.max() < 1 + bound
     np.testing.assert_allclose(radiance[-1][white_furnace.kept], 1, atol=bound)
     # The series has a geometric tail; after 32 reflections it is done at all points but those that
@@ -202,10 +205,11 @@ def test_asset_of_a_white_furnace(denoise):
         denoise=denoise,
     )
     bound = quadrature_error(scene_) + ROUNDING
-    assert asset.report["relative_error"] < 2e-4 and 0 < asset.report["bounce_energy_left"] < 1e-3
+    report = distant(asset).report
+    assert report["relative_error"] < 2e-4 and 0 < report["bounce_energy_left"] < 1e-3
     radiance = asset.relight(uniform_sky())[:, 0]
     assert radiance.min() > 0.98 and radiance.max() < 1 + bound + 2e-4
-    assert 1 - asset.report["bounce_energy_left"] - bound < radiance @ scene_.shares < 1
+    assert 1 - report["bounce_energy_left"] - bound < radiance @ scene_.shares < 1
 
 
 # --- surfaces without reflection ------------------------------------------------------------------
@@ -242,29 +246,15 @@ def test_what_reflects_nothing_to_any_point_is_direct_light_bit_for_bit(name, tm
             output=path,
             **settings,
         )
-        assert (
-            asset.report["bounces"] == 0
-            and asset.channels == 1
-            and len(asset.report["bounce_energy"]) == 1
-        )
-    expected = arrays(files.pop(("solve", 0)))
+        report = distant(asset).report
+        assert report["bounces"] == 0 and report["channels"] == 1
+        assert len(report["bounce_energy"]) == 1
+    expected = arrays_of(files.pop(("solve", 0)))
     for path in files.values():
-        found = arrays(path)
+        found = arrays_of(path)
         assert found.keys() == expected.keys()
         for key, values in expected.items():
             np.testing.assert_array_equal(found[key], values, err_msg=f"{path.name} {key}")
-
-
-def arrays(path):
-    """All arrays of an HDF5 file by their names."""
-    found = {}
-    with h5py.File(path) as file:
-        file.visititems(
-            lambda name, item: (
-                found.update({name: item[()]}) if isinstance(item, h5py.Dataset) else None
-            )
-        )
-    return found
 
 
 @pytest.mark.parametrize("indirect", ["solve", "paths"])
@@ -284,7 +274,7 @@ def test_brighter_surfaces_reflect_more(indirect):
         else:
             results.append(room.samples_of_paths(64, 2, every).mean(axis=1)[:, 0])
         assert np.isfinite(results[-1]).all() and (results[-1] > 0).all()
-    for darker, brighter in zip(results, results[1:]):
+    for darker, brighter in pairwise(results):
         assert (darker < brighter).all()
     once = results[0] / 1e-6
     assert (once < np.pi).all() and once.mean() > 0.3
@@ -600,7 +590,7 @@ def test_no_light_leaks_into_a_closed_box(indirect):
     irradiance = asset.irradiance(uniform_sky())
     assert np.abs(irradiance[~outward]).max() < 1e-4
     np.testing.assert_allclose(irradiance[outward], np.pi, rtol=2e-3)
-    assert asset.report["bounces"] == 0
+    assert distant(asset).report["bounces"] == 0
 
 
 @pytest.mark.parametrize("backs_reflect", [False, True])

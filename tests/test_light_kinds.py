@@ -95,7 +95,7 @@ def test_sums_of_lights():
     with pytest.raises(LightError, match="use a list"):
         Light((uniform_sky(),))
     with pytest.raises(LightError, match="looked up"):
-        as_light(SceneLight()).distant
+        _ = as_light(SceneLight()).distant
 
 
 def test_a_map_that_a_factor_makes_infinite_is_refused():

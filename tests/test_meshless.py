@@ -9,6 +9,7 @@ and its standard error added to the bounds of biases, so that a wrong alarm is l
 """
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,9 +22,10 @@ from mi_prt.directions.hemisphere import Hemisphere
 from mi_prt.evaluate.ground_truth import indirect_irradiance, local_irradiance, point_irradiance
 from mi_prt.lighting.emission import emission_of
 from mi_prt.lighting.light import as_light
+from mi_prt.lighting.own_light import SceneLight, resolve
 from mi_prt.lighting.to_mitsuba import lit_scene
-from mi_prt.points.points import POINT_FIELDS
-from mi_prt.points.samples import scatter_samples
+from mi_prt.points.particles import example_places
+from mi_prt.points.samples import scatter_points
 from mi_prt.scene.scene import open_scene
 from mi_prt.system.runtime import count_kernels, mitsuba
 from mi_prt.transport.depth import GRAZING, NEAREST, DepthBuffers, compress, log_depth
@@ -35,15 +37,7 @@ from mi_prt.transport.hemispheres import (
     cluster_frames,
     gathered,
 )
-from mi_prt.transport.local_direct import (
-    BEHIND,
-    CELLS,
-    CLEARANCE,
-    FAR,
-    SOFTNESS,
-    TOLERANCE,
-    LocalDirect,
-)
+from mi_prt.transport.local_direct import BEHIND, CELLS, CLEARANCE, FAR, SOFTNESS, TOLERANCE
 from mi_prt.transport.transfer import all_reflections, fit_senders
 from mi_prt.transport.transfer_matrix import Transfer, within_budget
 
@@ -61,7 +55,24 @@ SMALL = dict(
 
 
 def precompute(parts, **settings):
-    return mi_prt.precompute(parts, points="samples", **(SMALL | settings))
+    return mi_prt.precompute(parts, points="samples", transports="local", **(SMALL | settings))
+
+
+def local(asset):
+    """The transport of lights that move."""
+    return asset.transports["local"]
+
+
+def direct_kernel(asset):
+    """The LocalDirect with which an asset answers."""
+    return local(asset)._direct_light(asset.points)
+
+
+def scattered(opened, count, cluster_size, examples):
+    """Samples, their clusters, and places of example lights, as a precomputation finds them."""
+    points, clusters, flights = scatter_points(opened, count, round(count / cluster_size))
+    places = example_places(opened, examples, 0, flights)
+    return SimpleNamespace(points=points, clusters=clusters, places=places)
 
 
 def eye(origin, target=(0, 0, 0)):
@@ -100,12 +111,7 @@ def received(asset, light, component="total"):
 def some(points, count, seed=0):
     """So many of the points, and their indices."""
     index = np.sort(np.random.default_rng(seed).permutation(len(points))[:count])
-    return (
-        dataclasses.replace(
-            points, **{name: getattr(points, name)[index] for name in POINT_FIELDS}
-        ),
-        index,
-    )
+    return points.at(index), index
 
 
 def unblocked(points, place):
@@ -182,7 +188,7 @@ def test_outgoing_radiance_is_irradiance_times_albedo_over_pi(ball):
     result = asset.relight(PointLight((0, 0, 0), 1.0))
     assert np.abs(result / (ALBEDO / np.pi / RADIUS**2 / (1 - ALBEDO)) - 1).max() < 0.03
     # nothing is coloured
-    assert asset.report["channels"] == 1 and asset.transfer.matrix.shape[3] == 1
+    assert local(asset).channels == 1 and local(asset).transfer.matrix.shape[3] == 1
 
 
 def test_flux_of_a_light_near_a_wall(ball):
@@ -214,10 +220,9 @@ def test_particles_from_a_point_light_alone():
         lamp={"type": "point", "position": [0.3, 0.2, -0.4], "intensity": 1.0},
         ball=sphere(radius=2, flip_normals=True),
     )
-    samples, places = scatter_samples(open_scene(parts), 300, 100, 50)
-    assert (np.linalg.norm(places, axis=1) < 2).all()
-    again, same = scatter_samples(open_scene(parts), 300, 100, 50)
-    np.testing.assert_array_equal(places, same)
+    samples, again = (scattered(open_scene(parts), 300, 100, 50) for _ in range(2))
+    assert (np.linalg.norm(samples.places, axis=1) < 2).all()
+    np.testing.assert_array_equal(samples.places, again.places)
     np.testing.assert_array_equal(samples.points.positions, again.points.positions)
 
 
@@ -245,9 +250,8 @@ def under_constant_light(asset):
     """What is reflected to each sample, relative to what it should be, where all surfaces get the
     irradiance 1 directly.
     """
-    indirect = asset.transfer.indirect(
-        np.ones((len(asset.points), 3), np.float32), asset.samples.clusters
-    )
+    constant = np.ones((len(asset.points), 3), np.float32)
+    indirect = local(asset).transfer.indirect(constant, local(asset).clusters.slices)
     return indirect[:, 0] * (1 - FURNACE) / FURNACE
 
 
@@ -283,12 +287,12 @@ def one_hop(opened, samples, channels, count=256):
     reflection, by the core's rays, written out.
     """
     tracer, hemisphere = (
-        HemisphereTracer(opened, samples, Hemisphere(count), channels),
+        HemisphereTracer(opened, samples.points, samples.clusters, Hemisphere(count), channels),
         Hemisphere(count),
     )
-    n = len(samples)
+    n = len(samples.points)
     operator = np.zeros((n, n, channels))
-    for cluster in samples.clusters:
+    for cluster in samples.clusters.slices:
         seen = tracer.trace(cluster, cluster_frames(samples.points.normals[cluster]))
         found = seen.sample != NOTHING
         row = cluster.start + np.nonzero(found)[0]
@@ -304,7 +308,7 @@ def test_rows_of_one_hop_are_the_albedo(reflectance):
     directions sum up to one, the row to ρ.
     """
     opened = open_scene(furniture(reflectance))
-    samples, _ = scatter_samples(opened, 600, 200, 10)
+    samples = scattered(opened, 600, 200, 10)
     rows = one_hop(opened, samples, np.size(reflectance)).sum(axis=1)
     np.testing.assert_allclose(rows, np.broadcast_to(reflectance, rows.shape), rtol=2e-5)
 
@@ -320,7 +324,7 @@ def test_one_hop_conserves_energy():
         eye=eye((2, 2, 0.5)),
     )
     opened = open_scene(parts)
-    samples, _ = scatter_samples(opened, 600, 200, 10)
+    samples = scattered(opened, 600, 200, 10)
     operator, areas, albedo = (
         one_hop(opened, samples, 1)[..., 0],
         samples.points.areas,
@@ -395,8 +399,9 @@ def test_lights_add_up(room):
     np.testing.assert_allclose(
         room.irradiance(together, "direct"), sum(alone), rtol=1e-5, atol=1e-6
     )
-    indirect = [room.transfer.indirect(direct, room.samples.clusters) for direct in alone]
-    summed = room.transfer.indirect(sum(alone), room.samples.clusters)
+    transfer, clusters = local(room).transfer, local(room).clusters.slices
+    indirect = [transfer.indirect(direct, clusters) for direct in alone]
+    summed = transfer.indirect(sum(alone), clusters)
     assert relative_l2(sum(indirect), summed) < 1e-5
     cut = sum(room.irradiance(light, "indirect") for light in LIGHTS) - room.irradiance(
         together, "indirect"
@@ -419,7 +424,7 @@ def test_walls_bleed_their_colour(room):
     """White light in the left half makes the floor along the red wall redder than green, and that
     along the green wall greener than red; no wall is blue, so blue is below grey everywhere.
     """
-    assert room.report["channels"] == 3
+    assert local(room).channels == 3
     indirect, points = room.irradiance(PointLight((-0.3, 0.2, 0.4), 1.0), "indirect"), room.points
     floor = (points.normals[:, 1] > 0.9) & (points.positions[:, 1] < -0.99)
     red, green = (
@@ -456,7 +461,8 @@ def test_nothing_to_reflect(parts):
         assert "reflect" in str(error) and parts["ball"]["bsdf"]["reflectance"]["value"] == 0
         return
     light = PointLight((1.8, 1.5, 1), 5.0)
-    assert asset.transfer is None and asset.report["channels"] == 1 and asset.report["bounces"] == 0
+    assert local(asset).transfer is None and not asset.reflects
+    assert local(asset).channels == 1 and local(asset).report["bounces"] == 0
     assert not asset.irradiance(light, "indirect").any() and asset.irradiance(light, "direct").any()
     np.testing.assert_array_equal(asset.irradiance(light), asset.irradiance(light, "direct"))
 
@@ -541,7 +547,9 @@ def test_spot_and_area_lights_against_mitsuba(room, opened_room, light, most):
     Direct light at all samples (11 to 14 % RMSE of the spot with its hard edges in 4 runs, 3 % and
     4 to 6 % of the others), reflected at 150.
     """
-    lit = lit_scene(opened_room, light, modelled=True)
+    if light is None:
+        light = resolve(SceneLight(), opened_room)
+    lit = lit_scene(opened_room, as_light(light), modelled=True)
     points, index = some(room.points, 150)
     rmse, found, noise = errors(
         room.irradiance(light, "direct"), point_irradiance(lit, room.points, 64)
@@ -568,7 +576,7 @@ def test_misclassified_visibility(room, opened_room):
         ).sum()
         facing += front.sum()
     assert wrong / facing < 0.05
-    assert abs(room.report["misclassified_visibility"] - wrong / facing) < 0.02
+    assert abs(local(room).report["misclassified_visibility"] - wrong / facing) < 0.02
 
 
 def test_bounces_against_mitsubas_depth(room, opened_room):
@@ -579,7 +587,7 @@ def test_bounces_against_mitsubas_depth(room, opened_room):
     for bounces in (1, 2, "auto"):
         few = dict(count=1500, cluster_size=150, depth_directions=256, example_lights=150)
         asset = room if bounces == "auto" else precompute(cornell(), bounces=bounces, **few)
-        assert asset.report["bounces"] == bounces == (asset.reference_bounces or "auto")
+        assert local(asset).report["bounces"] == bounces == (asset.reference_bounces or "auto")
         points, index = some(asset.points, 200)
         truth = reflected_truth(opened_room, light, points, 256, asset.reference_bounces)
         weight = points.areas[:, None]
@@ -641,7 +649,7 @@ def test_a_light_at_a_sample(room, height):
     )
     assert np.isfinite(direct).all() and np.isfinite(indirect).all() and (indirect >= 0).all()
     np.testing.assert_allclose(direct[number], 1 / height**2 if height else 0, rtol=1e-3)
-    assert np.delete(direct, number, axis=0).max() < 1 / (0.5 * room.samples.radius) ** 2
+    assert np.delete(direct, number, axis=0).max() < 1 / (0.5 * room.points.layout.radius) ** 2
     assert 0.05 * 4 * np.pi < (room.points.areas @ indirect).max() < 3.3 * 4 * np.pi
 
 
@@ -658,7 +666,10 @@ def test_light_near_samples_against_mitsuba(room, opened_room):
     )
     light = PointLight(room.points.positions[number] + 1e-3 * room.points.normals[number], 1.0)
     truth = local_irradiance(opened_room.occluders, room.points, [light])
-    far = np.linalg.norm(room.points.positions - light.position, axis=1) > 3 * room.samples.radius
+    far = (
+        np.linalg.norm(room.points.positions - light.position, axis=1)
+        > 3 * room.points.layout.radius
+    )
     result = room.irradiance(light, "direct")
     assert relative_l2(result[far], truth[far]) < 0.25 and abs(bias(result[far], truth[far])) < 0.1
 
@@ -741,9 +752,9 @@ def hop(room, opened_room):
     """Samples of the room, the dense operator of one hop, and irradiance under examples and other
     lights, each scaled to its reflected flux.
     """
-    samples, places = scatter_samples(opened_room, 900, 90, 240)
+    samples = scattered(opened_room, 900, 90, 240)
     lights = np.concatenate(
-        [values for _, values in trace_examples(opened_room, samples.points, places)]
+        [values for _, values in trace_examples(opened_room, samples.points, samples.places)]
     )
     lights /= np.maximum(
         (samples.points.areas * samples.points.albedo.mean(axis=1)) @ lights, 1e-30
@@ -769,17 +780,15 @@ def test_importance_gives_better_reflections_than_pca(hop):
     are optimal for their own aim, of all bases of the same size.
     """
     samples, operator, examples, others = hop
-    area = np.sqrt(samples.points.areas)[:, None]
-    pca = fit_senders(examples, np.eye(len(samples), dtype=np.float32) * area, samples.clusters, 8)
-    important = fit_senders(examples, operator * area, samples.clusters, 8)
+    area, clusters = np.sqrt(samples.points.areas)[:, None], samples.clusters.slices
+    pca = fit_senders(examples, np.eye(len(area), dtype=np.float32) * area, clusters, 8)
+    important = fit_senders(examples, operator * area, clusters, 8)
     direct, reflected = {}, {}
     for name, senders in (("pca", pca), ("important", important)):
-        direct[name] = relative_l2(
-            area * represented(senders, samples.clusters, examples), area * examples
-        )
+        direct[name] = relative_l2(area * represented(senders, clusters, examples), area * examples)
         reflected[name] = [
             relative_l2(
-                area * (operator @ represented(senders, samples.clusters, x)), area * (operator @ x)
+                area * (operator @ represented(senders, clusters, x)), area * (operator @ x)
             )
             for x in (examples, others)
         ]
@@ -797,9 +806,9 @@ def test_sender_patterns_are_consistent(hop):
     samples, operator, examples, _ = hop
     captured = []
     for count in (2, 6, 12):
-        senders = fit_senders(examples, operator, samples.clusters, count)
+        senders = fit_senders(examples, operator, samples.clusters.slices, count)
         lost = total = 0.0
-        for number, cluster in enumerate(samples.clusters):
+        for number, cluster in enumerate(samples.clusters.slices):
             p, q = senders.encoder[cluster].astype(float), senders.decoder[cluster].astype(float)
             np.testing.assert_allclose(p.T @ q, np.eye(count), atol=2e-3)
             np.testing.assert_allclose(
@@ -1020,8 +1029,9 @@ def test_budgets_of_nothing():
 
 def test_the_report_tells_the_error_that_dropping_made(furnace):
     """Against the run that drops nothing: within the budget of 1 %, under example lights."""
-    assert 0 < furnace.report["transfer_error"] <= furnace.settings["transfer_error"] == 0.01
-    assert 0 < furnace.report["transfer_density"] < 1 and 0 < furnace.report["transfer_rank"] <= 64
+    report = local(furnace).report
+    assert 0 < report["transfer_error"] <= furnace.settings["transfer_error"] == 0.01
+    assert 0 < report["transfer_density"] < 1 and 0 < report["transfer_rank"] <= 64
 
 
 # --- all reflections ------------------------------------------------------------------------------
@@ -1187,8 +1197,8 @@ def direct_by_formula(asset, emission, sides):
     `sides` (k, 8) tell of each place which surface it stands over, see
     `test_what_a_light_stands_over`.
     """
-    points, depth, hemisphere = asset.points, asset.depth, asset.depth.hemisphere
-    clusters = asset.samples.clusters
+    points, depth, hemisphere = asset.points, local(asset).depth, local(asset).depth.hemisphere
+    clusters = local(asset).clusters.slices
     rotations = np.concatenate([cluster_frames(points.normals[cluster]) for cluster in clusters])
     distances = np.concatenate(
         [depth.depth(cluster, number) for number, cluster in enumerate(clusters)]
@@ -1239,7 +1249,9 @@ def test_what_a_light_stands_over(room, height):
     Not more than three quarters of what is free ahead are its room.
     """
     away, clearance, free = np.split(
-        room._direct._sides(emission_of(as_light(PointLight((0.5, height - 1, 0.5), 1.0))))[0, :5],
+        direct_kernel(room)._sides(emission_of(as_light(PointLight((0.5, height - 1, 0.5), 1.0))))[
+            0, :5
+        ],
         [3, 4],
     )
     if height < 0.5:
@@ -1262,10 +1274,7 @@ def test_the_kernel_is_its_formula():
         example_lights=20,
         quantize="none",
     )
-    rotations = np.concatenate(
-        [cluster_frames(asset.points.normals[cluster]) for cluster in asset.samples.clusters]
-    )
-    kernel = LocalDirect(asset.samples, asset.depth, rotations)
+    kernel = direct_kernel(asset)
     lights = [
         PointLight((0.38, -0.53, 0.7), (3.0, 2.0, 1.0)),
         PointLight((0.5, -0.999, 0.5), 1.0),
@@ -1295,7 +1304,7 @@ def test_the_kernel_is_its_formula():
 def test_no_light_is_dark(room):
     assert not any(
         values.any()
-        for values in room._direct.irradiance(
+        for values in direct_kernel(room).irradiance(
             emission_of(as_light(PointLight((0, 0, 0), 1.0)).distant)
         )
     )

@@ -295,7 +295,7 @@ def test_points_are_sound(name):
     np.testing.assert_allclose(np.linalg.norm(points.geometric_normals, axis=1), 1, atol=1e-5)
     assert ((points.normals * points.geometric_normals).sum(axis=1) > -1e-6).all()
     assert (points.areas > 0).all() and np.isfinite(points.positions).all()
-    front = np.unique(points.patches.nodes)
+    front = np.unique(points.layout.nodes)
     assert front[0] >= 0 and front[-1] < len(points)
     assert len(front) + points.report["back_points"] == len(points)
 
@@ -368,7 +368,7 @@ def test_areas_of_a_mesh_are_those_of_its_faces():
 
 
 def longest_edge(points):
-    corners = points.positions[points.patches.triangles()]
+    corners = points.positions[points.layout.triangles()]
     return np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).max()
 
 
@@ -671,7 +671,7 @@ def test_a_scene_in_which_every_point_is_buried(indirect):
     )
     assert (
         asset.buried.all()
-        and asset.report["bounces"] == 0
+        and asset.transports["distant"].report["bounces"] == 0
         and not asset.irradiance(uniform_sky()).any()
     )
 

@@ -7,13 +7,13 @@ an asset.
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from conftest import diffuse, disk, emitted, rectangle, scene, sky_of, sphere
-from mi_prt.points.interpolate import PatchInterpolator
 
 import mi_prt
 from mi_prt.errors import SceneError, SettingsError
@@ -49,9 +49,8 @@ def opened(edge_length=0.25, sensor=None, **parts):
     points = sample_points(opened, edge_length)
     lit = np.full((len(points), 3), np.pi, np.float32)
     asset = SimpleNamespace(
-        points=points, buried=np.zeros(len(points), bool), irradiance=lambda light: lit, path=None
+        points=points, buried=points.buried, irradiance=lambda light=None: lit, path=None
     )
-    asset.interpolator = lambda scene: PatchInterpolator(scene, points, asset.buried)
     return opened, asset, opened.mi_scene.sensors()[0]
 
 
@@ -179,7 +178,7 @@ def test_agrees_with_the_integrator_on_lights_textures_and_either_side():
     assert (expected.max(axis=1) == 0).sum() > 100 and (expected[:, 0] > 3).sum() > 100
     assert np.mean(error < 0.03) > 0.98
     assert error.mean() < 0.004
-    whole = render_image(asset, scene.mi_scene, sensor, spp=16)
+    whole = render_image(asset, scene.mi_scene, sensor, spp=16, irradiance=irradiance)
     assert np.abs(linear(asset, scene, sensor, irradiance) - whole).mean() < 0.02
 
 
@@ -347,19 +346,21 @@ def test_buried_points_give_their_share_to_the_others():
         sensor=camera((0, 4, 0.1), fov=20), floor=rectangle(size=1, bsdf=diffuse(1.0))
     )
     x = asset.points.positions[:, 0]
-    asset.buried = x < 0
+    asset.points = replace(asset.points, buried=x < 0)
+    asset.buried = asset.points.buried
     irradiance = np.pi * np.where(asset.buried, 0.0, 1.0)[:, None] * np.ones(3)
     seen = linear(asset, scene, sensor, irradiance, samples=1)[..., 0]
     between = (seen > 1e-3) & (seen < 0.999)
     assert between.mean() < 0.01
     assert 0.5 < (seen >= 0.999).mean() < 0.75  # half the floor and one column of triangles
-    asset.irradiance = lambda light: irradiance
     scene_lit, _, sensor_lit = opened(
         sensor=camera((0, 4, 0.1), fov=20),
         floor=rectangle(size=1, bsdf=diffuse(1.0)),
         sky={"type": "constant"},
     )
-    reference = render_image(asset, scene_lit.mi_scene, sensor_lit, spp=4)[..., 0]
+    reference = render_image(asset, scene_lit.mi_scene, sensor_lit, spp=4, irradiance=irradiance)[
+        ..., 0
+    ]
     assert np.abs(seen - reference).mean() < 0.01
 
 

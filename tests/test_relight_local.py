@@ -8,8 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import bias, diffuse, relative_l2
-from mi_prt.output.export import to_8bit
-from mi_prt.output.relight_local import animate_local
 
 import mi_prt
 from mi_prt import LightError, SettingsError
@@ -17,7 +15,10 @@ from mi_prt.cli import main
 from mi_prt.evaluate import ground_truth
 from mi_prt.lighting.to_mitsuba import lit_scene
 from mi_prt.output.film import light_path
+from mi_prt.output.moving import animate
 from mi_prt.output.relight import relight_to_file
+from mi_prt.precompute.settings import BY_NAME
+from mi_prt.render.image_file import to_8bit
 from mi_prt.scene.scene import open_scene
 from mi_prt.system.runtime import mitsuba
 
@@ -26,6 +27,7 @@ LIGHT = mi_prt.PointLight((0.3, 0.6, 0.4), (3.0, 2.5, 2.0))
 SIZE = (48, 36)
 ROOM = Path(__file__).resolve().parent.parent / "scenes" / "room.xml"
 SETTINGS = {
+    "transports": "local",
     "points": "samples",
     "count": 3000,
     "cluster_size": 150,
@@ -213,14 +215,16 @@ def test_comparison_tells_components(asset, tmp_path):
     assert report["points"]["relative_rmse_beyond_noise"] < 0.12
     assert report["components"]["direct"]["reference_noise"] == 0
     assert "direct light of it" in (tmp_path / "r" / "index.html").read_text()
-    assert json.loads((tmp_path / "r" / "report.json").read_text())["transfer_coefficients"] == 32
+    stored = json.loads((tmp_path / "r" / "report.json").read_text())
+    assert stored["transports"]["local"]["depth_coefficients"] == 50
+    assert [part.split()[0] for part in stored["light"]] == ["point"]
 
 
 @pytest.mark.parametrize("renderer", ["mitsuba", "raster"])
 def test_film_of_a_moving_light(asset, tmp_path, renderer):
     """Each frame is the picture of its place, at the first one's exposure."""
     path = light_path("-0.5,0.5,0.4 0.5,0.5,0.4")
-    told = animate_local(
+    told = animate(
         asset, tmp_path / "f-%d.png", path, 3, light=LIGHT, scene=room(), renderer=renderer, spp=4
     )
     assert told["frames"] == 3
@@ -251,7 +255,7 @@ def test_film_of_a_moving_light(asset, tmp_path, renderer):
 def test_film_moves_the_lamp_of_an_area_light(asset, tmp_path):
     """An area light is a shape: it is seen where it is in each frame."""
     light = mi_prt.AreaLight((0, 0, 0.5), (0.3, 0, 0), (0, 0.3, 0), 50.0)
-    animate_local(
+    animate(
         asset,
         tmp_path / "f-%d.png",
         light_path("-0.5,0,0.5 0.5,0,0.5"),
@@ -268,7 +272,9 @@ def test_film_moves_the_lamp_of_an_area_light(asset, tmp_path):
     "arguments, error",
     [
         ({"rotate": ("y", 30)}, SettingsError),
-        ({"nearest": 4}, SettingsError),
+        ({"nearest": 0}, SettingsError),
+        ({"spp": 0}, SettingsError),
+        ({"spp": 1 << 22}, SettingsError),
         ({"component": "glossy"}, SettingsError),
         ({"direct": "somewhere"}, SettingsError),
         ({"renderer": "raster", "direct": "pixels"}, SettingsError),
@@ -282,7 +288,15 @@ def test_what_such_assets_do_not_take_is_refused(asset, tmp_path, arguments, err
     assert not (tmp_path / "a.exr").exists()
 
 
-def test_distant_assets_refuse_components(tmp_path):
+def test_nearest_directions_stand_in_only_where_no_transport_is(asset, tmp_path):
+    """Transport of local light is there: their number changes nothing."""
+    relight_to_file(asset, tmp_path / "a.npz", LIGHT, nearest=4)
+    np.testing.assert_array_equal(
+        np.load(tmp_path / "a.npz")["irradiance"], asset.irradiance(LIGHT)
+    )
+
+
+def test_distant_assets_tell_no_components_apart_unless_asked(tmp_path):
     flat = {
         "type": "scene",
         "floor": wall(0, 0, 0, [1, 0, 0], -90, diffuse(0.5)),
@@ -296,7 +310,7 @@ def test_distant_assets_refuse_components(tmp_path):
 
 def test_films_without_a_light_to_move_are_refused(asset, tmp_path):
     with pytest.raises(LightError, match="--light"):
-        animate_local(asset, tmp_path / "f.gif", light_path("0,0,0 1,0,0"), 2, scene=room())
+        animate(asset, tmp_path / "f.gif", light_path("0,0,0 1,0,0"), 2, scene=room())
 
 
 # --- the command line -----------------------------------------------------------------------------
@@ -307,6 +321,10 @@ def from_file(tmp_path_factory):
     """An asset of the scene of two rooms, made by the command line."""
     made = tmp_path_factory.mktemp("cli") / "room.prt"
     options = [
+        "--points",
+        "samples",
+        "--transports",
+        "own,local",
         "--count",
         "1500",
         "--cluster-size",
@@ -317,7 +335,7 @@ def from_file(tmp_path_factory):
         "100",
     ]
     with pytest.raises(SystemExit) as end:
-        main(["precompute", str(ROOM), "-o", str(made), "--points", "samples", *options, "--json"])
+        main(["precompute", str(ROOM), "-o", str(made), *options, "--json"])
     assert end.value.code == 0
     return made
 
@@ -364,8 +382,13 @@ def test_command_line(from_file, tmp_path, capsys):
     )
     code, out, _ = run(capsys, "info", from_file, "--json")
     told = json.loads(out)
-    assert told["points"] == 1500 and told["storage"]["file"] == from_file.stat().st_size
-    assert told["storage"]["depth"] + told["storage"]["transfer"] < told["storage"]["file"]
+    assert told["points"] == 1500 and told["bytes"] == from_file.stat().st_size
+    stored = [t["storage"]["measured"] for t in told["transports"].values()]
+    assert set().union(*stored) == {"columns", "depth", "transfer"}
+    assert sum(sum(sizes.values()) for sizes in stored) < told["bytes"]
+    # each known error names the setting that lowers it
+    assert {entry["knob"] for entry in told["ledger"]} <= set(BY_NAME)
+    assert {entry["stage"].split(":")[0] for entry in told["ledger"]} == {"own", "local"}
     code, out, _ = run(
         capsys,
         "compare",
@@ -403,14 +426,23 @@ def test_command_line_refuses(capsys, tmp_path, arguments, word):
 
 
 def test_options_of_samples_need_samples(capsys, tmp_path):
-    code, _, error = run(capsys, "precompute", ROOM, "-o", tmp_path / "x.prt", "--count", "100")
+    """Where points are left to the program, a setting of samples asks for samples."""
+    options = ["-o", tmp_path / "x.prt", "--count", "100", "--points", "vertices"]
+    code, _, error = run(capsys, "precompute", ROOM, *options)
     assert code == 2 and "--count" in error and "vertices" in error
+    code, out, _ = run(capsys, "info", ROOM, "--count", "100", "--lamp-rays", "4", "--json")
+    chosen = json.loads(out)["settings"]
+    assert code == 0 and chosen["points"]["value"] == "samples"
+    assert "count" in chosen["points"]["reason"] and "edge_length" not in chosen
 
 
 def test_info_of_a_scene_predicts(capsys):
-    code, out, _ = run(capsys, "info", ROOM, "--points", "samples", "--count", "3000", "--json")
+    settings = ["--points", "samples", "--count", "3000", "--transports", "local"]
+    code, out, _ = run(capsys, "info", ROOM, *settings, "--json")
     told = json.loads(out)
-    assert code == 0 and told["requires"]["samples"] == 3000 and told["requires"]["colour"]
+    assert code == 0 and told["requires"]["points"] == 3000
+    assert not told["requires"]["albedo"]["grey"]
+    assert [light["name"] for light in told["lights"]] == ["lamp_1"]
     assert told["predicted"]["seconds"] > 0 and told["predicted"]["bytes"] > 1e5
 
 

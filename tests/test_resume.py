@@ -12,7 +12,7 @@ import time
 
 import numpy as np
 import pytest
-from conftest import cube, diffuse, disk, rectangle, scene
+from conftest import cube, diffuse, disk, distant, rectangle, scene
 
 import mi_prt
 import mi_prt.system.runtime
@@ -81,7 +81,8 @@ def undisturbed(files):
 def test_the_runs_are_three(files):
     """Coloured reflections, and another result by each way to them."""
     assets = {name: mi_prt.load(path) for name, path in files.items()}
-    assert {name: (asset.report["bounces"], asset.channels) for name, asset in assets.items()} == {
+    found = {name: distant(asset) for name, asset in assets.items()}
+    assert {name: (one.report["bounces"], one.channels) for name, one in found.items()} == {
         "direct": (0, 1),
         "solve": (2, 3),
         "paths": (2, 3),
@@ -301,16 +302,15 @@ def test_too_many_coefficients_cost_no_rays(tmp_path):
         progress=lambda *event: seen.append(event),
         **settings,
     )
-    assert len(asset.basis) == rank == 5 and seen[0][:3] == ("transport", seen[0][2], seen[0][2])
+    assert len(distant(asset).basis) == rank == 5
+    assert seen[0][:3] == ("transport", seen[0][2], seen[0][2])
 
 
 def test_a_workspace_belongs_to_one_process(tmp_path):
-    with (
-        durable(tmp_path / "a.prt", {}, False),
-        pytest.raises(SettingsError, match="another process"),
-        durable(tmp_path / "a.prt", {}, True),
-    ):
-        pass
+    with durable(tmp_path / "a.prt", {}, False):
+        other = durable(tmp_path / "a.prt", {}, True)
+        with pytest.raises(SettingsError, match="another process"), other:
+            pass
     assert os.listdir(tmp_path) == []
 
 
@@ -319,10 +319,8 @@ def test_what_stands_in_the_way(tmp_path):
     run.
     """
     (tmp_path / "a.prt.partial").write_text("")
-    with (
-        pytest.raises(SettingsError, match="a.prt.partial"),
-        durable(tmp_path / "a.prt", {}, False),
-    ):
+    blocked = durable(tmp_path / "a.prt", {}, False)
+    with pytest.raises(SettingsError, match="a.prt.partial"), blocked:
         pass
     (tmp_path / "b.prt.partial").mkdir()
     (tmp_path / "b.prt.partial" / "visibility.rows").write_bytes(b"old")
@@ -377,10 +375,8 @@ def test_a_folder_that_was_replaced_while_it_was_locked(tmp_path, monkeypatch):
     monkeypatch.setattr(fcntl, "flock", replaced)
     with durable(tmp_path / "a.prt", {}, False):
         monkeypatch.setattr(fcntl, "flock", flock)
-        with (
-            pytest.raises(SettingsError, match="another process"),
-            durable(tmp_path / "a.prt", {}, True),
-        ):
+        other = durable(tmp_path / "a.prt", {}, True)
+        with pytest.raises(SettingsError, match="another process"), other:
             pass
     assert len(calls) == 2
 
@@ -459,7 +455,7 @@ def test_reflections_that_are_solved_for_do_not_depend_on_threads_and_blocks(
     }
     settings = dict(directions="cubemap:8", edge_length=0.3, bounces=bounces, paths_per_point=32)
     mi_prt.precompute(scene(**walls), output=tmp_path / "a.prt", **settings)
-    assert mi_prt.load(tmp_path / "a.prt").report["bounces"] > MOST_SUMMED_BOUNCES
+    assert distant(mi_prt.load(tmp_path / "a.prt")).report["bounces"] > MOST_SUMMED_BOUNCES
     monkeypatch.setattr(room, "LANES", LANES)
     before = mitsuba_threads()
     mi_prt.system.runtime.set_threads(3)
@@ -495,7 +491,7 @@ def test_passes_of_a_fit_that_failed_do_not_reach_another(tmp_path, monkeypatch)
     """A search for a share of the variance starts its later fits from earlier ones. When it fails
     and so many components are asked for outright, that fit is the one of an undisturbed run.
     """
-    module, tried = sys.modules["mi_prt.precompute.precompute"], []
+    module, tried = sys.modules["mi_prt.precompute.distant"], []
     leading = pca._leading
     monkeypatch.setattr(
         pca, "_leading", lambda *arguments: tried.append(arguments[2]) or leading(*arguments)
@@ -521,7 +517,7 @@ def test_paths_kept_in_a_span_that_was_given_up_do_not_reach_another(tmp_path, m
     it. As many coefficients as the first fit had, asked for outright, have another span by a
     little: the paths of an undisturbed run are told in that one.
     """
-    module, fits = sys.modules["mi_prt.precompute.precompute"], []
+    module, fits = sys.modules["mi_prt.precompute.distant"], []
     walls = {
         name: rectangle(normal, -np.array(normal), 1)
         for name, normal in dict(a=(0, 1, 0), b=(1, 0, 0), c=(0, 0, 1)).items()
@@ -680,9 +676,8 @@ from mi_prt.scene.scene import open_scene
 from test_resume import RUNS, SCENE
 pca.NEGLIGIBLE = 0
 settings = RUNS[sys.argv[3]]
-# what Mitsuba and Embree take once
 small = dict(directions="cubemap:2", edge_length=1, coefficients=4)
-mi_prt.precompute(SCENE, **settings | small)
+mi_prt.precompute(SCENE, **settings | small)  # what Mitsuba and Embree take once
 limit = resident_bytes() + 60_000_000
 def blocks(**options):
     stages = []

@@ -2,6 +2,8 @@
 directions.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 import scipy.stats
@@ -25,11 +27,12 @@ from mi_prt.points.particles import (
     STEPS,
     WARM_UP,
     cross_surfaces,
+    example_places,
     free_places,
     trace_particles,
 )
 from mi_prt.points.sample_locator import ALIGNMENT, REACH, SHARPNESS, SampleLocator
-from mi_prt.points.samples import scatter_samples
+from mi_prt.points.samples import scatter_points
 from mi_prt.points.thinning import embedded, thin
 from mi_prt.scene.scene import open_scene
 from mi_prt.system.runtime import mitsuba
@@ -63,8 +66,22 @@ def room(size=1.0, centre=(0, 0, 0), **rest):
     )
 
 
-def scattered(parts, count=4000, cluster_size=200, examples=50, seed=0):
-    return scatter_samples(open_scene(parts), count, cluster_size, examples, seed)[0]
+@dataclass(frozen=True)
+class Samples:
+    """Points, their clusters, and flights of the particles that found them."""
+
+    points: object
+    clusters: object
+    flights: object
+
+    @property
+    def radius(self):
+        return self.points.layout.radius
+
+
+def scattered(parts, count=4000, cluster_size=200, seed=0):
+    clusters = max(1, round(count / cluster_size))
+    return Samples(*scatter_points(open_scene(parts), count, clusters, seed))
 
 
 def lanes(vectors, kind=None):
@@ -401,7 +418,7 @@ def test_a_sensor_that_sends_no_rays_does_not_matter():
 )
 def test_scenes_without_a_reflecting_side_in_reach_are_refused(parts):
     with pytest.raises(SceneError, match="find 0 places on surfaces that reflect"):
-        scatter_samples(open_scene(parts), 100, 10, 10)
+        scattered(parts, 100, 10)
 
 
 # --- areas ----------------------------------------------------------------------------------------
@@ -489,7 +506,7 @@ def test_areas_sum_to_the_reachable_area(name, tmp_path):
     )
     assert (samples.points.areas >= 0).all()
     assert samples.points.report["coverage"] > 0.95
-    assert len(samples) == count
+    assert len(samples.points) == count
 
 
 def test_areas_are_unbiased():
@@ -535,13 +552,8 @@ def test_both_sides_of_a_thin_wall_have_samples(wall_samples):
 
 
 @pytest.fixture(scope="module")
-def room_and_places():
-    return scatter_samples(open_scene(room()), 4000, 200, 200)
-
-
-@pytest.fixture(scope="module")
-def room_samples(room_and_places):
-    return room_and_places[0]
+def room_samples():
+    return scattered(room())
 
 
 @pytest.fixture(scope="module")
@@ -558,15 +570,18 @@ def cornell_samples():
 @pytest.mark.parametrize("name", ["room_samples", "cornell_samples"])
 def test_every_sample_is_in_one_cluster_of_about_the_wanted_size(name, request):
     samples = request.getfixturevalue(name)
-    sizes = np.diff(samples.starts)
+    clusters, count = samples.clusters, len(samples.points)
+    sizes = np.diff(clusters.starts)
     wanted = 200 if name == "room_samples" else 250
-    assert samples.starts[0] == 0 and samples.starts[-1] == len(samples)
-    assert len(samples.clusters) == len(samples.roots) == round(len(samples) / wanted)
+    # samples are in the order of their clusters
+    np.testing.assert_array_equal(clusters.order, np.arange(count))
+    assert clusters.starts[0] == 0 and clusters.starts[-1] == count
+    assert len(clusters) == len(clusters.slices) == len(clusters.roots) == round(count / wanted)
     assert (sizes > 0).all() and sizes.max() < 3 * wanted
     assert wanted / 2 < np.median(sizes) < 1.5 * wanted
     assert all(
         cluster.start <= root < cluster.stop
-        for cluster, root in zip(samples.clusters, samples.roots)
+        for cluster, root in zip(clusters.slices, clusters.roots)
     )
 
 
@@ -576,43 +591,45 @@ def test_clusters_are_compact_and_face_one_way(name, request):
     cluster's radius on a plane, √(A/πc).
     """
     samples = request.getfixturevalue(name)
-    points = samples.points
-    for cluster, root in zip(samples.clusters, samples.roots):
+    points, clusters = samples.points, samples.clusters
+    for cluster, root in zip(clusters.slices, clusters.roots):
         assert (points.normals[cluster] @ points.normals[root] > 0.5).all()
         assert (points.normals[cluster] @ points.normals[cluster].T > -0.5).all()
         reach = np.linalg.norm(points.positions[cluster] - points.positions[root], axis=1).max()
-        assert reach < 3 * np.sqrt(points.areas.sum() / np.pi / len(samples.roots))
+        assert reach < 3 * np.sqrt(points.areas.sum() / np.pi / len(clusters))
 
 
 def test_clusters_do_not_mix_the_sides_of_a_thin_wall(wall_samples):
     normals = wall_samples.points.normals
-    assert (
-        min((normals[cluster] @ normals[cluster].T).min() for cluster in wall_samples.clusters)
-        > 0.99
-    )
+    clusters = wall_samples.clusters.slices
+    assert min((normals[cluster] @ normals[cluster].T).min() for cluster in clusters) > 0.99
 
 
 @pytest.mark.parametrize("count, cluster_size, clusters", [(1, 1000, 1), (40, 1, 40)])
 def test_small_counts(count, cluster_size, clusters):
-    samples = scattered(room(), count, cluster_size, examples=1)
-    assert len(samples) == count and len(samples.clusters) == clusters
-    assert np.diff(samples.starts).sum() == count
+    samples = scattered(room(), count, cluster_size)
+    assert len(samples.points) == count and len(samples.clusters) == clusters
+    assert np.diff(samples.clusters.starts).sum() == count
     assert np.isfinite(samples.points.areas).all() and samples.points.areas.sum() > 0
 
 
 def test_samples_are_seeded():
     opened = open_scene(room())
-    (first, places), (second, again) = (
-        scatter_samples(opened, 500, 50, 20, seed=1) for _ in range(2)
-    )
+    first, second = (Samples(*scatter_points(opened, 500, 10, seed=1)) for _ in range(2))
     for name in ("positions", "normals", "areas", "albedo"):
         np.testing.assert_array_equal(getattr(first.points, name), getattr(second.points, name))
-    np.testing.assert_array_equal(first.starts, second.starts)
+    np.testing.assert_array_equal(first.clusters.starts, second.clusters.starts)
+    places, again = (example_places(opened, 20, 1, made.flights) for made in (first, second))
     np.testing.assert_array_equal(places, again)
+    other = scatter_points(opened, 500, 10, seed=2)[0]
+    assert not np.array_equal(first.points.positions, other.positions)
 
 
-def test_places_for_lights_keep_a_distance_in_the_room(room_and_places):
-    places = room_and_places[1]
+@pytest.mark.parametrize("flown", [True, False], ids=["of the samples", "of their own"])
+def test_places_for_lights_keep_a_distance_in_the_room(room_samples, flown):
+    """Whether the flights are those that found samples, or are traced for the places alone."""
+    flights = room_samples.flights if flown else None
+    places = example_places(open_scene(room()), 200, 0, flights)
     assert places.shape == (200, 3) and np.abs(places).max() < 1
     # 200 places in 8 m³ each have 0.04 m³, a ball of radius 0.21 m; at random the nearest two of
     # them would be 0.02 m apart.
@@ -622,7 +639,7 @@ def test_places_for_lights_keep_a_distance_in_the_room(room_and_places):
 @pytest.mark.parametrize("count", [0, -1, 1_000_001])
 def test_counts_out_of_range_are_refused(count):
     with pytest.raises(SettingsError, match="1,000,000"):
-        scatter_samples(open_scene(room()), count, 100, 10)
+        scatter_points(open_scene(room()), count, 10)
 
 
 @pytest.mark.parametrize("size", [1e-3, 1e4])

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import LightError
+from ..errors import LightError, SettingsError
 from ..lighting.environment import LightWarning
 from ..lighting.light import Light
 from ..lighting.own_light import SceneLight, resolve
@@ -67,8 +67,8 @@ class Asset:
         rotate : (axis, degrees), optional
             Turns the distant light.
         scene : Scene, path, dict or mi.Scene, optional
-            Needed where the light contains distant light of the scene, and only then opened; by
-            default where it was.
+            Needed where the light contains distant light of the scene, or lamps of which the asset
+            holds no transport of their own, and only then opened; by default where it was.
 
         Returns
         -------
@@ -80,26 +80,57 @@ class Asset:
             If the scene has no light of a name, or none at all.
         SceneError
             If the scene is needed and not to be had.
+        SettingsError
+            If there is no distant light to turn.
         """
         if light is None:
             light = self._own_light()
         names = {emitter["name"]: emitter["distant"] for emitter in self.emitters}
         opened = scene if scene_is_open(scene) else lambda: open_scene_of(self, scene)
         light = resolve(light, opened, names)
-        return light if rotate is None else light.rotated(*rotate)
+        if any(map(self._needs_place, light.parts)):
+            light = resolve(light, open_scene_of(self, scene), names)
+        if rotate is None:
+            return light
+        if light.distant.is_empty:
+            raise SettingsError(
+                "a rotation turns distant light, and there is none in this light: leave it out"
+                " (--rotate)"
+            )
+        return light.rotated(*rotate)
+
+    def _needs_place(self, part):
+        """Whether only transport answers for a part that must know where it shines, and the part
+        does not.
+        """
+        transports = self.transports.values()
+        return (
+            not part.is_placed
+            and not any(t.takes(part) for t in transports)
+            and any(t.stands_in_for(part) for t in transports)
+        )
 
     def _own_light(self):
         """The scene's own light, as far as the asset holds it."""
-        held = {True: "distant" in self.transports}
-        held[False] = any(kind in self.transports for kind in ("own", "local"))
-        names = [emitter["name"] for emitter in self.emitters if held[emitter["distant"]]]
-        if self.emitters and not names:
-            raise LightError(
-                f"of the scene's own lights ({', '.join(self.own_lights)}) this asset, with"
-                f" transports {','.join(self.transports)}, holds none: pass a light (--light), or"
-                " precompute it with other transports (--transports)"
-            )
+        emitters = self.emitters
+        names = [emitter["name"] for emitter in emitters if self._holds(emitter["distant"])]
+        if emitters and not names:
+            raise self._holds_none(self.own_lights)
         return [SceneLight(name) for name in names] or SceneLight()
+
+    def _holds(self, is_distant):
+        """Whether distant, or local, light of the scene is in the asset: not where transport of
+        distant light only stands in for it.
+        """
+        kinds = ("distant",) if is_distant else ("own", "local")
+        return any(kind in self.transports for kind in kinds)
+
+    def _holds_none(self, names):
+        return LightError(
+            f"of the scene's own lights ({', '.join(names)}) this asset, with transports"
+            f" {','.join(self.transports)}, holds none: pass a light (--light), or precompute it"
+            " with other transports (--transports)"
+        )
 
     def as_baked(self, scene):
         """Light of the emitters of a scene as they are now, as far as the asset holds it.
@@ -112,21 +143,21 @@ class Asset:
         Returns
         -------
         Light
-            Resolved; empty where the asset holds none of it.
+            Resolved.
 
         Raises
         ------
         LightError
-            If a lamp whose light is baked was changed otherwise than by dimming it.
+            If the scene has no light, or the asset holds none of it, or if a lamp whose light is
+            baked was changed otherwise than by dimming it.
         """
         own = self.transports.get("own")
-        parts = []
-        for part in resolve(SceneLight(), scene).parts if scene.own_lights else ():
-            if own is not None and own.takes(part):
-                part = own.as_baked(part)
-            if any(t.takes(part) or t.stands_in_for(part) for t in self.transports.values()):
-                parts.append(part)
-        return Light(parts)
+        parts = [p for p in resolve(SceneLight(), scene).parts if self._holds(p.is_distant)]
+        if not parts:
+            raise self._holds_none([light.name for light in scene.own_lights])
+        return Light(
+            own.as_baked(part) if own is not None and own.takes(part) else part for part in parts
+        )
 
     def prepare_light(self, light=None, scene=None):
         """The same light in a form that turns in milliseconds.
@@ -175,7 +206,7 @@ class Asset:
                 held = "; ".join(f"{k} ({t.takes_words})" for k, t in self.transports.items())
                 wanted = [k for k, t in TRANSPORTS.items() if t.is_for(part)]
                 raise LightError(
-                    f"{part.words} is light that this asset holds no transport for; it holds"
+                    f"this asset holds no transport for this light ({part.words}); it holds"
                     f" {held}: precompute the scene again with transports"
                     f" {','.join([*self.transports, *wanted])} (--transports)"
                 )
@@ -232,7 +263,7 @@ class Asset:
 
     def answered(self, shares, component="total", nearest=1):
         """Irradiance (n, 3) float32 under light shared out, without warnings; see `irradiance`."""
-        Question(Light(()), component)
+        Question(Light(()), component, nearest)
         total = np.zeros((len(self.points), 3), np.float32)
         for kind, light in shares.items():
             question = Question(light, component, nearest)

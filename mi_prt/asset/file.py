@@ -8,25 +8,43 @@ from typing import Any
 from ..errors import AssetError, SettingsError
 from ..points.layout import LAYOUTS
 from ..points.points import Points
-from ..system.schema import Anything, Flag, ListOf, MapOf, Record, Text, check
-from ..transport.transport import TRANSPORTS
+from ..system.schema import (
+    Anything,
+    Flag,
+    ListOf,
+    MapOf,
+    Nothing,
+    Number,
+    OneOf,
+    Record,
+    Text,
+    check,
+)
+from ..transport.transport import BOUNCES, TRANSPORTS
 from . import container
+from .provenance import path_from_file, path_in_file
 
 _TEXTS = ("scene", "settings", "versions", "report")
 _EMITTER = Record({"name": Text(), "kind": Text(), "distant": Flag()})
+_LEFT_OUT = Record(
+    {"what": Text(), "shapes": ListOf(Text()), "share": OneOf(Nothing(), Number(-1e30, 1e30))}
+)
+_SCENE = Record(
+    {
+        "kind": Text("file", "dict", "object"),
+        "path": OneOf(Nothing(), Text()),
+        "is_relative": Flag(),
+        "parameters": MapOf(Text()),
+        "hash": Text(),
+        "appearance": Text(),
+        "left_out": ListOf(_LEFT_OUT),
+    }
+)
+_SETTINGS = Record({"bounces": OneOf(Nothing(), BOUNCES), "points": Text()}, others=Anything())
 _HEADER = Record(
     {
-        "scene": Record(
-            {
-                "kind": Text(),
-                "path": Anything(),
-                "parameters": MapOf(Text()),
-                "hash": Text(),
-                "appearance": Text(),
-                "left_out": ListOf(MapOf(Anything())),
-            }
-        ),
-        "settings": MapOf(Anything()),
+        "scene": _SCENE,
+        "settings": _SETTINGS,
         "versions": MapOf(Text()),
         "report": MapOf(Anything()),
         "emitters": ListOf(_EMITTER),
@@ -54,7 +72,9 @@ def write(asset, path, folder=None):
         If the path cannot be written, for example because the disk is full.
     """
     points = asset.points
+    scene = asset.scene | {"path": path_in_file(asset.scene, path)}
     header = {name: getattr(asset, name) for name in _TEXTS} | {
+        "scene": scene,
         "emitters": list(asset.emitters),
         "points": {
             "layout": points.layout.kind,
@@ -89,19 +109,26 @@ def read(path) -> dict[str, Any]:
     """
     with container.opened(path) as stored:
         try:
-            return _fields(stored) | {"path": Path(path).absolute()}
+            fields = _fields(stored)
         except (ValueError, KeyError, TypeError, SettingsError) as error:
             raise AssetError(
                 f"'{path}' is no sound asset: {' '.join(str(error).split())}"
             ) from None
+    scene = fields["scene"]
+    scene["path"] = path_from_file(scene["path"], path)
+    return fields | {"path": Path(path).absolute()}
 
 
 def _fields(stored):
     header = stored.header
     check(header, _HEADER, "header")
+    if (header["scene"]["kind"] == "file") != (header["scene"]["path"] is not None):
+        raise ValueError("a scene of a file has a path, and no other has")
     layout, schema = _schema(header)
     surfaces = tuple(header["points"]["surfaces"])
-    sizes = stored.check(schema, {"surfaces": len(surfaces)})
+    check(list(surfaces), ListOf(layout.SURFACE), "points.surfaces")
+    if not stored.check(schema, {"surfaces": len(surfaces)})["n"]:
+        raise ValueError("it has no points")
     arrays = {name: stored.array(name) for name in schema if name in stored.names}
 
     def under(prefix):
@@ -118,10 +145,20 @@ def _fields(stored):
         kind: TRANSPORTS[kind].from_arrays(part, under(f"transports/{kind}/"), points)
         for kind, part in header["transports"].items()
     }
-    assert sizes["n"] == len(points)
     texts = {name: header[name] for name in _TEXTS}
     emitters = tuple(header["emitters"])
+    _check_emitters(emitters, transports)
     return {"points": points, "transports": transports, "emitters": emitters, **texts}
+
+
+def _check_emitters(emitters, transports):
+    """Names are unique, and lamps whose light is baked are among the local ones."""
+    names = [emitter["name"] for emitter in emitters]
+    if len(set(names)) < len(names):
+        raise ValueError("emitters repeat a name")
+    local = {emitter["name"] for emitter in emitters if not emitter["distant"]}
+    if "own" in transports and not local.issuperset(transports["own"].names):
+        raise ValueError("transports.own.lamps are no emitters of the scene")
 
 
 def _schema(header):

@@ -1,5 +1,7 @@
 """The tie between an asset and the scene it came from."""
 
+import os
+import stat
 import warnings
 from collections import Counter
 from pathlib import Path
@@ -10,13 +12,14 @@ from ..scene.scene import Scene, open_scene
 
 
 def describe_scene(scene, points, transports):
-    """What an asset records of its scene: kind, path, parameters, hash, appearance, left_out (which
-    see).
+    """What an asset records of its scene: kind, path, is_relative (whether files keep the path
+    relative to themselves), parameters, hash, appearance, left_out (which see).
     """
     source = scene.source
     return {
         "kind": source.kind,
         "path": source.path,
+        "is_relative": source.is_relative,
         "parameters": source.parameters,
         "hash": scene.hash,
         "appearance": scene.appearance,
@@ -111,13 +114,7 @@ def open_scene_of(asset, scene=None, parameters=None):
                 f"the asset came from a scene {recorded['kind']} in memory: pass the scene"
                 " (--scene)"
             )
-        _check_place(recorded["path"])
-        if not Path(recorded["path"]).is_file():
-            raise SceneError(
-                f"the asset's scene '{recorded['path']}' is not there any more: pass its new path"
-                " (--scene)"
-            )
-        scene = recorded["path"]
+        scene = _checked_place(recorded["path"])
     opened = open_scene(scene, recorded["parameters"] if parameters is None else parameters)
     if opened.hash != recorded["hash"]:
         name = opened.source.path or f"the scene {opened.source.kind}"
@@ -140,12 +137,54 @@ def scene_is_open(scene):
     return isinstance(scene, Scene)
 
 
-def _check_place(path):
-    """Refuse a recorded path that leads elsewhere than to a file of this machine."""
-    if path.startswith(("//", "\\\\")) or "\0" in path:
+def path_in_file(recorded, asset):
+    """How a file keeps the path of the scene that is recorded (dict): from its own folder on where
+    it was given relative, so that both can be moved together.
+
+    Parameters
+    ----------
+    recorded : dict
+        See `describe_scene`.
+    asset : path
+        The file.
+    """
+    path = recorded["path"]
+    if path is None or not recorded["is_relative"]:
+        return path
+    try:
+        relative = os.path.relpath(path, Path(asset).absolute().parent)
+    except ValueError:  # on another drive
+        return path
+    return Path(relative).as_posix()
+
+
+def path_from_file(path, asset):
+    """The absolute path of what `path_in_file` gave. No file is touched."""
+    if path is None or path.startswith(_NETWORK) or os.path.isabs(path):
+        return path
+    return os.path.normpath(os.path.join(Path(asset).absolute().parent, path))
+
+
+_NETWORK = ("//", "\\\\")
+_SYSTEM = ("/dev/", "/proc/", "/sys/")  # files there may have no end, or act when they are read
+
+
+def _checked_place(path):
+    """A recorded path, if it leads to a regular file of this machine; else SceneError."""
+    shown = ascii(path)[1:-1][:200]
+    if path.startswith(_NETWORK):
         raise SceneError(
-            f"the asset's scene '{path}' is no file of this machine: pass it (--scene)"
+            f"the asset's scene '{shown}' is no file of this machine: pass it (--scene)"
         )
-    place = Path(path)
-    if place.exists() and not place.is_file():
-        raise SceneError(f"the asset's scene '{path}' is no regular file: pass the scene (--scene)")
+    try:
+        mode = os.stat(path).st_mode
+        is_file = stat.S_ISREG(mode) and not os.path.realpath(path).startswith(_SYSTEM)
+    except (OSError, ValueError):  # names that no file can have
+        raise SceneError(
+            f"the asset's scene '{shown}' is not there any more: pass its new path (--scene)"
+        ) from None
+    if not is_file:
+        raise SceneError(
+            f"the asset's scene '{shown}' is no regular file: pass the scene (--scene)"
+        )
+    return path

@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from math import inf
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -55,6 +55,7 @@ class Basis(ABC):
     holds_reflections: ClassVar[bool] = True
     joins_channels: ClassVar[bool] = False
     work: ClassVar[tuple] = (1, 1)
+    sqrt_weights: Any
     copies: ClassVar[float] = 2.0
 
     # --- from light to irradiance -------------------------------------------------------------
@@ -177,6 +178,12 @@ class Basis(ABC):
         channels : 1 or 3
             Colour channels of the transport.
         """
+
+    def check_stored(self, directions):
+        """Raise ValueError unless its arrays, of a file, are those of a basis on a lattice."""
+        weights = self.sqrt_weights
+        if len(weights) != len(directions):
+            raise ValueError(f"a basis of {len(weights)} directions on {directions}")
 
     @classmethod
     def coefficient_shapes(cls, channels):

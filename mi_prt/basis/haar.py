@@ -70,6 +70,11 @@ class HaarBasis(Basis):
         """See `check_haar`."""
         check_haar(directions, None if components == "auto" else components)
 
+    def check_stored(self, directions):
+        """On a cubemap whose sides are a power of two; see `Basis.check_stored`."""
+        super().check_stored(directions)
+        check_haar(directions, len(self))
+
     @classmethod
     def coefficient_bytes(cls, points, directions, components, rays_per_direction=1):
         """Each number with the index of its wavelet."""
@@ -89,7 +94,7 @@ class HaarBasis(Basis):
     def shapes(cls, channels):
         """See `Basis.shapes`."""
         return {
-            "sqrt_weights": Array("f4", ("s",), least=0, unit="sr^(1/2)"),
+            "sqrt_weights": Array("f4", ("s",), least=1e-12, unit="sr^(1/2)"),
             "captured_variance": Array("f8", ("d",)),
         }
 
@@ -203,6 +208,11 @@ class SharedHaarBasis(LinearBasis):
     def check(cls, directions, components):
         """See `check_haar`."""
         check_haar(directions, None if components == "auto" else components)
+
+    def check_stored(self, directions):
+        """On a cubemap whose sides are a power of two; see `Basis.check_stored`."""
+        super().check_stored(directions)
+        check_haar(directions, len(self))
 
     @classmethod
     def fit_bytes(cls, points, directions, components):

@@ -185,6 +185,12 @@ class HarmonicBasis(LinearBasis):
         """The harmonics as functions."""
         return FIT_BYTES * components * directions
 
+    def check_stored(self, directions):
+        """All functions of its bands are there; see `Basis.check_stored`."""
+        super().check_stored(directions)
+        if self.bands**2 != len(self):
+            raise ValueError(f"{len(self)} spherical harmonics are no whole bands")
+
     @property
     def bands(self):
         """Number of bands."""

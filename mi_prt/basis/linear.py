@@ -45,7 +45,7 @@ class LinearBasis(Basis):
         return {
             "vectors": Array("f4", ("d", *colour, "s"), unit="sr^(-1/2)"),
             "mean": Array("f4", (*colour, "s"), unit="irradiance per unit radiance and steradian"),
-            "sqrt_weights": Array("f4", ("s",), least=0, unit="sr^(1/2)"),
+            "sqrt_weights": Array("f4", ("s",), least=1e-12, unit="sr^(1/2)"),
             "captured_variance": Array("f8", ("d",)),
         }
 

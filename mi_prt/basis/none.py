@@ -70,6 +70,11 @@ class NoBasis(Basis):
         """See `Basis.shapes`."""
         return {"weights": Array("f4", ("s",), least=0, unit="sr")}
 
+    def check_stored(self, directions):
+        """See `Basis.check_stored`."""
+        if len(self.weights) != len(directions):
+            raise ValueError(f"{len(self.weights)} weights on {directions}")
+
     @classmethod
     def coefficient_shapes(cls, channels):
         """See `Basis.coefficient_shapes`."""

@@ -8,13 +8,16 @@ from typing import Annotated
 
 import typer
 
-from ..errors import PrtError
+from ..errors import PrtError, SettingsError
 from . import options as take
 from .options import (
+    LIGHTS_HELP,
     Component,
     Define,
     Direct,
     Environment,
+    Frames,
+    FramesPerSecond,
     Json,
     Lights,
     Nearest,
@@ -24,6 +27,7 @@ from .options import (
     Sensor,
     Size,
     Threads,
+    flowing,
     with_settings,
 )
 from .show import note, print_json, print_nested, progress_bar, table
@@ -44,6 +48,7 @@ app = typer.Typer(
 
 
 @app.command(epilog="Example: mi-prt doctor --json")
+@flowing
 def doctor(as_json: Json = False):
     """Check this machine: LLVM, Mitsuba, Embree, raster platform; with the remedy for each
     fault.
@@ -63,6 +68,7 @@ def doctor(as_json: Json = False):
 
 @app.command(epilog="Example: mi-prt info scenes/still_life.xml --directions cubemap:16 --json")
 @with_settings
+@flowing
 def info(
     path: Annotated[Path, typer.Argument(help="A scene (XML) or an asset.")],
     settings: dict,
@@ -92,6 +98,7 @@ def info(
     )
 )
 @with_settings
+@flowing
 def precompute(
     scene: Annotated[Path, typer.Argument(help="A Mitsuba XML file.")],
     output: Annotated[
@@ -151,7 +158,8 @@ def precompute(
 
 
 @app.command(
-    epilog=(
+    epilog=LIGHTS_HELP
+    + (
         "Examples: mi-prt relight teapot.prt -o teapot.png --envmap sky.exr --rotate y:90 --size"
         " 640x480\n\nmi-prt relight room.prt -o dusk.png --light 'scene:sky_1*0.05' --light"
         " scene:floor_lamp\n\nmi-prt relight room.prt -o lamp.png --light point:0,1.5,0:8,7,6"
@@ -159,6 +167,7 @@ def precompute(
         " --light-path '-1,1.5,0 1,1.5,0 1,1.5,1' --renderer raster"
     )
 )
+@flowing
 def relight(
     asset_path: Annotated[Path, typer.Argument(metavar="FILE", help="An asset.")],
     output: Annotated[
@@ -190,8 +199,8 @@ def relight(
             help="Move the first --light along these places; OUT is a film.",
         ),
     ] = None,
-    frames: Annotated[int, typer.Option("--frames", metavar="N", help="Of the film.")] = 48,
-    fps: Annotated[int, typer.Option("--fps", help="Frames of the film in a second.")] = 25,
+    frames: Frames = None,
+    fps: FramesPerSecond = None,
     scene: OtherScene = None,
     threads: Threads = None,
     as_json: Json = False,
@@ -217,21 +226,26 @@ def relight(
         "direct": direct,
         "rotate": turned,
     }
+    film = {k: v for k, v in (("frames", frames), ("fps", fps)) if v is not None}
     if light_path is not None:
         path = path_of(light_path)
         with progress_bar() as progress:
-            result = animate(asset, output, path, frames, fps, chosen, progress=progress, **shown)
+            result = animate(asset, output, path, light=chosen, progress=progress, **film, **shown)
+    elif film:
+        raise SettingsError("--frames and --fps are of a film: give --light-path as well")
     else:
         result = relight_to_file(asset, output, chosen, nearest=nearest, **shown)
     _show(result if as_json else {"wrote": str(output)} | result, as_json)
 
 
 @app.command(
-    epilog=(
+    epilog=LIGHTS_HELP
+    + (
         "Examples: mi-prt compare teapot.prt -o teapot-report --spp 512 --json\n\nmi-prt compare"
         " room.prt -o room-report --light point:0,1.5,0:8,7,6"
     )
 )
+@flowing
 def compare(
     asset_path: Annotated[Path, typer.Argument(metavar="FILE", help="An asset.")],
     output: Annotated[
@@ -293,7 +307,7 @@ def main(arguments=None):
 
         if not _only_help(sys.argv[1:] if arguments is None else arguments):
             quiet_mitsuba()
-        app(arguments, standalone_mode=True)
+        app(arguments, standalone_mode=True, prog_name="mi-prt")
     except PrtError as error:
         print(f"mi-prt: {error}", file=sys.stderr)
         sys.exit(error.exit_code)

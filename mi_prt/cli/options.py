@@ -1,6 +1,7 @@
 """Options of the command line; those of a precomputation are made from its settings."""
 
 import inspect
+import re
 from functools import wraps
 from pathlib import Path
 from typing import Annotated
@@ -8,7 +9,8 @@ from typing import Annotated
 import typer
 
 from ..errors import SettingsError
-from ..lighting.parse import forms
+from ..lighting.part import LIGHTS
+from ..output.film import FPS, FRAMES
 from ..precompute.options import Flag
 from ..precompute.settings import OPTIONS
 
@@ -20,6 +22,12 @@ _PANELS = {
     "own": "Transport: the scene's own lamps",
     "local": "Transport: lamps that move",
 }
+
+
+def _unmarked(text):
+    """Text in which a bracket before a letter is no markup."""
+    return re.sub(r"\[(?=[a-z])", r"\\[", text)
+
 
 Json = Annotated[
     bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else.")
@@ -42,8 +50,7 @@ Lights = Annotated[
     typer.Option(
         "--light",
         metavar="SPEC",
-        help=f"{forms()}. One number is grey; W/sr, W/m², W/(m² sr), degrees. May be repeated:"
-        " lights add up, also to --envmap.",
+        help="A light, see below. May be repeated: lights add up, also to --envmap.",
     ),
 ]
 Component = Annotated[
@@ -79,7 +86,29 @@ Sensor = Annotated[int, typer.Option("--sensor", help="Index of the scene's sens
 Size = Annotated[
     str | None, typer.Option("--size", metavar="WxH", help="Image size; default: the sensor's.")
 ]
+Frames = Annotated[
+    int | None, typer.Option("--frames", metavar="N", help=f"Of the film [{FRAMES}].")
+]
+FramesPerSecond = Annotated[
+    int | None, typer.Option("--fps", metavar="N", help=f"Frames of the film in a second [{FPS}].")
+]
 Seed = Annotated[int, typer.Option("--seed", help="Same seed, same result.")]
+
+LIGHTS_HELP = "\n\n".join(
+    [
+        "Lights:",
+        *(_unmarked(LIGHTS[kind].FORM) for kind in sorted(LIGHTS)),
+        "Each with a factor if need be: *0.3 or *r,g,b. In the place of r,g,b one number is grey.",
+        "",
+    ]
+)
+
+
+def flowing(command):
+    """A command whose help has no line breaks but those between paragraphs."""
+    paragraphs = inspect.cleandoc(command.__doc__).split("\n\n")
+    command.__doc__ = "\n\n".join(" ".join(paragraph.split()) for paragraph in paragraphs)
+    return command
 
 
 def with_settings(command):
@@ -106,7 +135,7 @@ def _parameter(option):
     """A keyword parameter for Typer; None where the user does not give it."""
     flag = "--" + option.name.replace("_", "-")
     default = "" if option.default in (None, False) else f" [{_shown(option.default)}]"
-    rest = {"help": option.help + default, "rich_help_panel": _PANELS[option.group]}
+    rest = {"help": _unmarked(option.help + default), "rich_help_panel": _PANELS[option.group]}
     if isinstance(option, Flag):
         kind = typer.Option(f"{flag}/--no-{flag[2:]}", show_default=False, **rest)
         annotation = Annotated[bool | None, kind]

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..render.image import check_samples
 from ..scene.scene import scale_of
 from ..system.runtime import mitsuba
 
@@ -252,10 +253,16 @@ def image(mi_scene, sensor, spp, seed=0, max_depth=2):
     -------
     Reference
         mean and standard_error (h, w, 3).
+
+    Raises
+    ------
+    SettingsError
+        See `check_samples`.
     """
     mi = mitsuba()
     integrator = mi.load_dict({"type": "path", "max_depth": max_depth})
     half = max(1, (spp + 1) // 2)
+    check_samples(sensor, half)
     first, second = (
         np.array(mi.render(mi_scene, sensor=sensor, integrator=integrator, spp=half, seed=s))[
             ..., :3

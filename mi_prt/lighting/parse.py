@@ -10,12 +10,12 @@ from .values import from_text
 __all__ = ["forms", "parse_light", "parse_rotation"]
 _KIND = re.compile(r"([A-Za-z][\w-]*)(?::(.+))?", re.DOTALL)
 _DIMMED = re.compile(r"(.*)\*([-+.\w]+(?:,[-+.\w]+)*)", re.DOTALL)
+_FACTOR = "; with a factor behind it if need be: *0.3 or *r,g,b"
 
 
 def forms():
     """The forms of all kinds of light, for help and errors."""
-    known = ", ".join(LIGHTS[kind].FORM for kind in sorted(LIGHTS))
-    return f"{known}; each with a factor if need be: *0.3 or *r,g,b"
+    return "; ".join(LIGHTS[kind].FORM for kind in sorted(LIGHTS)) + _FACTOR
 
 
 def parse_light(text):
@@ -47,7 +47,9 @@ def parse_light(text):
         raise LightError(f"light '{text}': {error}") from None
     except ValueError:  # not numbers, or not as many parts
         pass
-    raise LightError(f"light '{text}' is not of the form {forms()}")
+    if form and form[1] in LIGHTS:
+        raise LightError(f"light '{text}' is not of the form {LIGHTS[form[1]].FORM}{_FACTOR}")
+    raise LightError(f"light '{text}' is of no known kind: use {forms()}")
 
 
 def _factor(text):

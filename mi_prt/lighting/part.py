@@ -36,6 +36,8 @@ class LightPart(ABC):
         Whether it stands for lights of the scene that `resolve` has not looked up yet.
     own_name : str or None
         Name of the scene's own lamp that it is.
+    is_placed : bool
+        Whether it knows where it shines; a lamp of a scene that is not open does not.
     """
 
     kind: ClassVar[str]
@@ -46,6 +48,7 @@ class LightPart(ABC):
     is_shape: ClassVar[bool] = False
     of_scene: ClassVar[bool] = False
     own_name = None
+    is_placed = True
     __array_ufunc__ = None  # so that NumPy leaves `array * part` to the part
 
     @property

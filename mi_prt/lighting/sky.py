@@ -1,7 +1,6 @@
 """Any distant emitter as an environment map: analytic skies with their suns."""
 
 import numpy as np
-import scipy.ndimage
 
 from ..system.runtime import mitsuba
 from .environment import EnvironmentMap
@@ -21,6 +20,8 @@ def baked(emitter):
     Samples that Mitsuba itself would take of the emitter tell where a sun is: those brighter than
     the map has them mark pixels to refine, and so does contrast within a pixel.
     """
+    from scipy.ndimage import maximum_filter  # slow to import
+
     height, width = BAKED_HEIGHT, 2 * BAKED_HEIGHT
     every = np.indices((height, width)).reshape(2, -1).T
     pixels, contrast = (
@@ -38,7 +39,7 @@ def baked(emitter):
     marked = contrast[..., 0] > 1.5
     marked[row[brighter], column[brighter]] = True
     # A neighbour may hold the edge of what was found; around a pole all columns are neighbours.
-    marked = scipy.ndimage.maximum_filter(marked, 3, mode=("nearest", "wrap"))
+    marked = maximum_filter(marked, 3, mode=("nearest", "wrap"))
     for pole in (slice(0, 3), slice(-3, None)):
         marked[pole] |= marked[pole].any()
     found = np.argwhere(marked)

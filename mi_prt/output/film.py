@@ -14,6 +14,7 @@ from ..render.image_file import to_8bit, write_displayed
 from ..system.files import check_writable, replacing
 
 VIDEOS = (".mp4", ".gif")
+FRAMES, FPS = 48, 25  # of a film, by default
 MAX_FPS = {".mp4": 240, ".gif": 50}  # viewers slow down a GIF of more
 PATH_FORM = "write it as 'x,y,z x,y,z …', two or more positions separated by spaces or semicolons"
 _STEPS = 1024  # of the polygon that measures and stands for each piece of a path

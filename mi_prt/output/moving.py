@@ -9,7 +9,7 @@ from ..errors import LightError
 from ..lighting.light import Light
 from ..render.display import display
 from ..render.picture import RENDERERS, Picture
-from .film import check_frames_output, write_frames
+from .film import FPS, FRAMES, check_frames_output, write_frames
 
 FRAME_SAMPLES = 1  # of a frame's pixel, along each side, of splats
 
@@ -18,8 +18,8 @@ def animate(
     asset,
     output,
     path,
-    frames=48,
-    fps=25,
+    frames=FRAMES,
+    fps=FPS,
     light=None,
     scene=None,
     sensor=0,

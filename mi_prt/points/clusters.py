@@ -59,11 +59,13 @@ class Clusters:
         return Clusters(np.arange(len(self.order)), self.starts, self.roots)
 
     def check(self, count):
-        """Raise ValueError unless they divide so many points."""
+        """Raise ValueError unless they divide so many points, each with its root inside."""
         if self.starts[0] != 0 or self.starts[-1] != count or (np.diff(self.starts) <= 0).any():
             raise ValueError("clusters/starts do not divide the points")
         if (np.bincount(self.order, minlength=count) != 1).any():
             raise ValueError("clusters/order does not hold each point once")
+        if (self.roots < self.starts[:-1]).any() or (self.roots >= self.starts[1:]).any():
+            raise ValueError("clusters/roots are not in their clusters")
 
 
 def make_clusters(points, count, seed=0):

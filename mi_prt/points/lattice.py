@@ -13,7 +13,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from ..system.schema import Array, Flag, Number, Record, Text, check
+from ..system.schema import Array, Flag, Number, Record, Text
 from .layout import LAYOUTS, Layout
 
 MAX_LEVEL = 1 << 15
@@ -62,6 +62,8 @@ class Patches(Layout):
         "back": Array("i4", ("patches",), least=0, below="n"),
     }
 
+    SURFACE: ClassVar[Record] = _SURFACE
+
     def locator(self, scene, points):
         """See `Layout.locator`."""
         from .locate import PatchLocator
@@ -87,6 +89,8 @@ class Patches(Layout):
         """
         u, v = self.levels.astype(np.int64).T
         sizes = node_count(u, v)
+        if not len(u):
+            raise ValueError("layout/levels are of no patch")
         if (u < 1).any() or (self.offsets != np.cumsum(sizes) - sizes).any():
             raise ValueError("layout/offsets do not fit the levels of the patches")
         if sizes.sum() != len(self.nodes):
@@ -95,7 +99,6 @@ class Patches(Layout):
             raise ValueError("layout/back leads beyond the points")
         first = 0
         for surface in points.surfaces:
-            check(surface, _SURFACE, "points.surfaces")
             if surface["first_patch"] != first:
                 raise ValueError("points.surfaces do not list the patches in order")
             first += surface["patches"]

@@ -7,6 +7,7 @@ from typing import ClassVar
 import numpy as np
 
 from ..system.registry import Registry
+from ..system.schema import Record, Text
 
 LAYOUTS = Registry("layout of points", "mi_prt.points")
 
@@ -82,12 +83,15 @@ class Layout(ABC):
     kind : str
     SHAPES : dict
         What its arrays must be in files, {name: Array}; n is the number of points.
+    SURFACE : Record
+        What the record of each surface must be in files.
     buries : bool
         Whether points may lie where no light gets, inside or against other geometry.
     """
 
     kind: ClassVar[str]
     SHAPES: ClassVar[dict]
+    SURFACE: ClassVar[Record]
     buries: ClassVar[bool] = True
 
     @abstractmethod
@@ -130,6 +134,7 @@ class Spacing(Layout):
 
     kind = "spacing"
     SHAPES: ClassVar[dict] = {}
+    SURFACE: ClassVar[Record] = Record({"name": Text(), "kind": Text()})
     buries = False  # particles do not get where light does not
 
     def locator(self, scene, points):
@@ -154,6 +159,6 @@ class Spacing(Layout):
     def from_arrays(cls, arrays, report):
         """See `Layout.from_arrays`."""
         radius = report.get("radius")
-        if not isinstance(radius, float) or not 0 < radius < 1e30:
-            raise ValueError(f"points.report.radius is {radius!r}, no positive number")
+        if not isinstance(radius, float) or not 1e-15 < radius < 1e15:
+            raise ValueError(f"points.report.radius is {ascii(radius)[:60]}, no length in metres")
         return cls(radius)

@@ -10,6 +10,7 @@ from .layout import Locator
 from .tessellate import TESSELLATED_SHAPES
 
 NO_PATCH = 0xFFFFFFFF
+_BEHIND = 0.1  # of the points' spacing, by which a point may lie behind a place that sees it
 _LEAST_KEPT = 1e-4  # weight of the points around a hit that are not buried, below which all count
 
 
@@ -34,9 +35,13 @@ class PatchLocator(Locator):
     """
 
     def __init__(self, scene, points):
+        import drjit as dr
+
         mi = mitsuba()
         patches = points.layout
         self._keep = mi.Float(np.where(points.buried, 0.0, 1.0).astype(np.float32))
+        self._positions = mi.Float(points.positions.ravel())
+        self._behind = dr.opaque(mi.Float, _BEHIND * float(np.median(patches.spacing(points))))
         self._match(scene, points)
         self._levels = mi.UInt32(patches.levels.ravel().astype(np.uint32))
         self._offsets = mi.UInt32(patches.offsets.astype(np.uint32))
@@ -71,16 +76,24 @@ class PatchLocator(Locator):
         return index, found & (total > _LEAST_KEPT)
 
     def nearest(self, pi, si, ray, active, seen_from=None):
-        """See `Locator.nearest`: the one of the three with the largest weight. They lie on the face
-        that is met, so that none is behind it.
-        """
+        """See `Locator.nearest`: the one of the three with the largest weight."""
         import drjit as dr
 
         points, kept, found = self._kept(pi, si, active)
+        if seen_from is not None:
+            kept = [w * self._ahead(p, seen_from, found) for p, w in zip(points, kept)]
         second = kept[1] > kept[0]
         index, weight = dr.select(second, points[1], points[0]), dr.maximum(kept[0], kept[1])
         index = dr.select(kept[2] > weight, points[2], index)
         return index, found & (dr.maximum(weight, kept[2]) > _LEAST_KEPT)
+
+    def _ahead(self, point, seen_from, active):
+        """1 where points are in front of the places that see them, else 0."""
+        import drjit as dr
+
+        origin, up = seen_from
+        position = dr.gather(mitsuba().Point3f, self._positions, point, active)
+        return dr.select(dr.dot(position - origin, up) > -self._behind, 1.0, 0.0)
 
     def _kept(self, pi, si, active):
         """The points around hits, their weights without buried ones, and whether there are any."""
@@ -94,7 +107,7 @@ class PatchLocator(Locator):
         """Fill the tables that lead from (surface, primitive) to patches."""
         mi = mitsuba()
         faces = _FaceIndex(points)
-        analytic = {s["signature"]: s["first_patch"] for s in points.surfaces}
+        analytic = {s["signature"]: s["first_patch"] for s in points.surfaces if s["patches"] > 0}
         tables, starts, total = [np.empty(0, np.int64)], [], 0
         for surface in scene.surfaces:
             if surface.kind not in TESSELLATED_SHAPES:

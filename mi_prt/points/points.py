@@ -65,7 +65,7 @@ class Points:
     report: dict
 
     SHAPES: ClassVar[dict] = {
-        "positions": Array("f4", ("n", 3), unit="m"),
+        "positions": Array("f4", ("n", 3), -1e15, 1e15, unit="m"),
         "normals": Array("f4", ("n", 3)),
         "geometric_normals": Array("f4", ("n", 3)),
         "albedo": Array("f4", ("n", 3), unit="1, linear RGB reflectance"),

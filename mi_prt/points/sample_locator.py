@@ -10,10 +10,11 @@ from .layout import Locator
 REACH = 2.5  # radii up to which a sample is found
 VOXEL = 1.5  # radii along the edge of a voxel
 MOST_VOXELS = 1 << 24
+VOXELS_A_SAMPLE = 512  # at most: far more than samples on surfaces ask for
 BEHIND = 0.1  # radii behind a place from which on samples are not seen from there
 SHARPNESS = 4  # power of the interpolation's weights in distance: they fall to a half at 1 radius
-_BELOW_ONE = 1 - 2**-24  # the largest float32 below 1
 ALIGNMENT = 8  # power of their cosine between normals: surfaces at right angles do not mix
+_BELOW_ONE = 1 - 2**-24  # the largest float32 below 1
 
 
 class SampleLocator:
@@ -48,7 +49,10 @@ class SampleLocator:
             VOXEL * radius,
             float((np.prod((high - low).astype(np.float64)) / MOST_VOXELS) ** (1 / 3)),
         )
-        size = np.maximum(np.ceil((high - low) / edge).astype(np.int64), 1)
+        size = _grid(high - low, edge)
+        while np.prod(size.astype(float)) > min(MOST_VOXELS, VOXELS_A_SAMPLE * len(positions)):
+            edge *= 1.25  # long and thin, or with samples far off
+            size = _grid(high - low, edge)
         shown = np.arange(len(positions)) if buried is None else np.flatnonzero(~buried)
         starts, listed = _lists(positions[shown], low, edge, size, reach)
         # Dr.Jit refuses to gather from an array of no elements.
@@ -236,6 +240,11 @@ class SpacedLocator(Locator):
         normals, _, reflects = facing(si, ray, self._surfaces)
         index, distance = self._samples.nearest(si.p, normals.shading, active & reflects, seen_from)
         return index, active & reflects & dr.isfinite(distance)
+
+
+def _grid(extent, edge):
+    """Voxels (3,) along each axis of an extent in metres."""
+    return np.clip(np.ceil(extent / edge), 1, 1e15).astype(np.int64)
 
 
 def _lists(positions, low, edge, size, reach):

@@ -87,9 +87,8 @@ def _areas(scene, hits, radius, seed):
     locator = SampleLocator(hits.positions, hits.normals, radius)
     low, high = hits.positions.min(axis=0), hits.positions.max(axis=0)
     ball = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2 * 1.01, radius)
-    counts, near, blocks = np.zeros(len(hits), np.int64), 0, 0
-    for crossings, area in cross_surfaces(scene, *ball, seed):  # noqa: B007  (the last area)
-        blocks += 1
+    counts, near = np.zeros(len(hits), np.int64), 0
+    for blocks, (crossings, area) in enumerate(cross_surfaces(scene, *ball, seed), 1):
         if len(crossings):
             index, distance = locator.nearest(
                 *(_lanes(x) for x in (crossings.positions, crossings.normals))
@@ -99,10 +98,11 @@ def _areas(scene, hits, radius, seed):
             covered = distance < COVERED * radius
             counts += np.bincount(np.array(index)[covered], minlength=len(hits))
             near += int((distance < radius).sum())
+        areas = counts * (area / blocks)
         if counts.sum() >= CROSSINGS * len(hits) or blocks == _MOST_BLOCKS:
             break
     total = max(int(counts.sum()), 1)
-    return _smoothed(hits, radius, counts * (area / blocks)), near / total
+    return _smoothed(hits, radius, areas), near / total
 
 
 def _smoothed(hits, radius, areas):

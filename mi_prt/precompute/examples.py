@@ -38,7 +38,7 @@ class Examples:
         job, settings = self._job, self._job.settings
         irradiance = job.workspace.keep("examples", lambda: self._traced(clusters))
         points = job.points.at(clusters.order)
-        reflected = points.areas * points.albedo.mean(axis=1)
+        reflected = np.where(points.buried, 0, points.areas) * points.albedo.mean(axis=1)
         flux = reflected @ irradiance
         # Each example counts alike, however much of its light falls on what reflects.
         scale = np.where(flux > 0, 1 / np.maximum(flux, np.float32(1e-30)), 0)
@@ -70,7 +70,7 @@ def importance(job, clusters, lanes):
         n = len(points)
         random = np.random.default_rng(job.settings.seed)
         receivers = random.standard_normal((n, FUNCTIONALS), dtype=np.float32)
-        receivers *= np.sqrt(points.areas)[:, None]
+        receivers *= np.sqrt(np.where(points.buried, 0, points.areas))[:, None]
         result = np.zeros((n, FUNCTIONALS), np.float32)
         for cluster in clusters.slices:
             seen = tracer.trace(cluster, cluster_frames(points.normals[cluster]))

@@ -93,7 +93,10 @@ def _settings(plan, points, reasons, costs):
     """The settings that would be used, each with its reason; those of points and transports that
     will not be there are left out.
     """
-    chosen = asdict(plan.settings)
+    settings = plan.settings
+    chosen = asdict(settings)
+    only_distant = plan.transports == ("distant",)
+    chosen["bounces"] = settings.distant_bounces if only_distant else settings.lamp_bounces
     groups = {"general", chosen["points"], *plan.transports}
     if chosen["edge_length"] == "auto" and "edge_length" in points.report:
         reasons["edge_length"] = (
@@ -107,7 +110,7 @@ def _settings(plan, points, reasons, costs):
     found = {}
     for name, value in chosen.items():
         option = BY_NAME[name]
-        if option.group in groups:
+        if option.group in groups and value is not None:
             as_default = "default" if value == option.default else "as asked"
             found[name] = {"value": value, "reason": reasons.get(name, as_default)}
     return found

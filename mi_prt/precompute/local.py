@@ -12,6 +12,7 @@ from ..basis.clustered import leading_components
 from ..directions.hemisphere import Hemisphere
 from ..errors import SettingsError
 from ..points.clusters import make_clusters
+from ..points.layout import Spacing
 from ..points.particles import example_places
 from ..system.memory import resident_bytes
 from ..transport.bits import LANES
@@ -263,9 +264,7 @@ class LocalBuilder(Builder):
         """See `Builder.forecast`: whole runs with few points."""
         settings, n = self.job.settings, len(self.job.points)
         self._pilot(FIRST_POINTS)  # compiles the kernels
-        started = time.perf_counter()
-        points = self._pilot(PROBE_POINTS)
-        seconds = (time.perf_counter() - started) / points
+        seconds = self._pilot(PROBE_POINTS)
         width = 2 if settings.quantize == "16" else 4
         clusters = len(self._slices)
         columns = clusters * settings.transfer_coefficients * self._channels
@@ -284,13 +283,16 @@ class LocalBuilder(Builder):
         }
 
     def _pilot(self, count):
-        """A whole run at some of the points; returns their number."""
+        """A whole run at some of the points; returns seconds for each of them."""
         from .workspace import temporary
 
         job = self.job
         index = np.random.default_rng(job.settings.seed).permutation(len(job.points))[:count]
         clusters = max(1, round(len(index) / job.settings.cluster_size))
-        points = job.points.at(np.sort(index))
+        # Without their neighbours points have no patches: they are found by distance.
+        farther = np.sqrt(len(job.points) / len(index))
+        spacing = float(np.median(job.points.layout.spacing(job.points)))
+        points = replace(job.points.at(np.sort(index)), layout=Spacing(spacing * farther))
         made = make_clusters(points, clusters, job.settings.seed)
         with temporary() as workspace:
             pilot = replace(
@@ -301,8 +303,10 @@ class LocalBuilder(Builder):
                 progress=lambda *_: None,
                 limit=1 << 62,
             )
-            LocalBuilder(pilot).build()
-        return len(index)
+            builder = LocalBuilder(pilot)
+            started = time.perf_counter()
+            builder.build()
+            return (time.perf_counter() - started) / len(index)
 
 
 def _product(left, hop):

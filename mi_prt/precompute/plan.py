@@ -91,8 +91,8 @@ def _foreign(name, group, points, transports):
     option = "--" + name.replace("_", "-")
     if group in ("vertices", "samples"):
         return f"{name} ({option}) is a setting of points {group}, and these are {points}"
+    wanted = ",".join(kind for kind in TRANSPORTS if kind in (*transports, group))
     return (
         f"{name} ({option}) is a setting of the transport {group}, and what is built is"
-        f" {', '.join(transports)}: leave it out, or ask for transports"
-        f" {','.join([*transports, group])} (--transports)"
+        f" {', '.join(transports)}: leave it out, or ask for transports {wanted} (--transports)"
     )

@@ -16,7 +16,7 @@ from ..points.samples import scatter_points
 from ..scene.scene import open_scene
 from ..system.memory import free_bytes, parse_bytes, resident_bytes
 from ..system.runtime import count_kernels, peak_memory_bytes, versions
-from .job import BUILDERS, Job
+from .job import BUILDERS, Clock, Job
 from .plan import make_plan
 from .workspace import durable, temporary
 
@@ -93,12 +93,13 @@ def measure(
         raise SettingsError("resume needs the output of the run to continue")
     limit = _limit(max_memory)
     progress = progress or (lambda stage, done, total, detail="": None)
+    clock = Clock()
     with count_kernels() as kernels:
         opened = open_scene(scene, parameters)
         if output is not None and output == _path_of(opened):
             raise SettingsError(f"output '{output}' is the scene itself: give another name")
         plan = make_plan(opened, settings)
-        job, builders = begin(opened, plan, progress, limit)
+        job, builders = begin(opened, plan, progress, limit, clock)
         with _workspace(output, job, builders, resume) as job.workspace:
             asset = _built(job, plan, builders)
             if output is not None:
@@ -124,7 +125,7 @@ def _path_of(scene):
     return Path(scene.source.path).resolve() if scene.source.path else None
 
 
-def begin(scene, plan, progress, limit):
+def begin(scene, plan, progress, limit, clock=None):
     """Points, and what will build the transports of a plan.
 
     Returns
@@ -139,7 +140,7 @@ def begin(scene, plan, progress, limit):
     """
     settings = plan.settings
     kinds = [BUILDERS[kind] for kind in plan.transports]
-    job = Job(scene, settings, None, None, None, progress, limit)
+    job = Job(scene, settings, None, None, None, progress, limit, clock or Clock())
     job.clock.lap("scene")
     job.points, job.clusters, job.flights = make_points(
         scene, settings, any(kind.needs_clusters for kind in kinds), progress

@@ -9,6 +9,7 @@ from ..system.runtime import mitsuba
 from .integrator import integrator_for
 
 MAX_PIXELS = 1 << 26
+MAX_LANES = (1 << 32) - 1  # of a wavefront: more end the process
 
 
 def render_image(asset, mi_scene, sensor, spp=64, seed=0, irradiance=None, direct="points"):
@@ -32,11 +33,29 @@ def render_image(asset, mi_scene, sensor, spp=64, seed=0, irradiance=None, direc
     -------
     (h, w, 3) float32
         Linear radiance.
+
+    Raises
+    ------
+    SettingsError
+        See `check_samples`.
     """
+    check_samples(sensor, spp)
     integrator = integrator_for(asset, irradiance, direct)
     return np.array(
         mitsuba().render(mi_scene, sensor=sensor, integrator=integrator, spp=spp, seed=seed)
     )[..., :3]
+
+
+def check_samples(sensor, spp):
+    """Raise SettingsError unless a sensor's image can have so many samples in each pixel: one at
+    least, and all of them in one wavefront.
+    """
+    width, height = sensor.film().crop_size()
+    most = MAX_LANES // (width * height)
+    if not 1 <= spp <= most:
+        raise SettingsError(
+            f"spp must be 1…{most:,} for an image of {width}x{height} pixels, got {spp}"
+        )
 
 
 def pick_sensor(mi_scene, index):

@@ -29,6 +29,8 @@ class SceneSource:
         Absolute path of a file.
     parameters : dict
         Values for the file's `<default>` parameters.
+    is_relative : bool
+        Whether the path was given relative to the working directory.
     content : dict or mi.Scene or None
         The dict or scene itself; not written to assets.
     """
@@ -36,6 +38,7 @@ class SceneSource:
     kind: str
     path: str | None = None
     parameters: dict = field(default_factory=dict)
+    is_relative: bool = False
     content: Any = field(default=None, repr=False, compare=False)
 
 
@@ -212,10 +215,13 @@ def open_scene(source, parameters=None):
     if not isinstance(source, str | os.PathLike):
         raise SceneError(f"a scene is a path, a dict or an mi.Scene, got {type(source).__name__}")
     path = Path(source).absolute()
-    if not path.is_file():
+    if not path.exists():
         raise SceneError(f"scene '{path}' does not exist")
+    if not path.is_file():
+        what = "a folder" if path.is_dir() else "no regular file"
+        raise SceneError(f"scene '{path}' is {what}: give a Mitsuba XML file")
     loaded = _loaded(f"scene '{path}'", mi.load_file, str(path), **parameters)
-    return Scene(loaded, SceneSource("file", str(path), parameters))
+    return Scene(loaded, SceneSource("file", str(path), parameters, not Path(source).is_absolute()))
 
 
 def _loaded(what, load, *arguments, **parameters):

@@ -8,6 +8,7 @@ names a module, which registers when it is imported).
 import importlib
 import importlib.metadata
 import pkgutil
+import reprlib
 from collections.abc import Mapping
 
 from ..errors import SettingsError
@@ -63,7 +64,8 @@ class Registry(Mapping):
         """
         self._import()
         if not isinstance(name, str) or name not in self._kinds:
-            raise self._error(f"{self._what} '{name}' is not known: use {', '.join(self._kinds)}")
+            shown = reprlib.repr(name)  # of a hostile file: any text
+            raise self._error(f"{self._what} {shown} is not known: use {', '.join(self._kinds)}")
         return self._kinds[name]
 
     def __contains__(self, name):

@@ -27,7 +27,7 @@ VARIANTS = ("cuda_ad_rgb", "llvm_ad_rgb")
 THREADS_PER_CORE = 8
 """Most threads per core that `set_threads` accepts: more only costs memory."""
 
-PACKAGES = ("mi_prt", "mitsuba", "drjit", "numpy", "scipy", "h5py")
+PACKAGES = ("mi_prt", "mitsuba", "drjit", "numpy", "scipy")
 """Distributions whose versions are stored with every result."""
 
 RASTER_PLATFORMS = ("osmesa", "egl")

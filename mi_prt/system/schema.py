@@ -219,20 +219,24 @@ class MapOf:
 
 
 class Record:
-    """An object of these `fields` (dict of specifications) and no others.
+    """An object of these `fields` (dict of specifications).
 
-    Those named in `optional` may be missing.
+    Those named in `optional` may be missing. Other fields are refused, unless `others` says what
+    they must be.
     """
 
-    def __init__(self, fields, optional=()):
-        self.fields, self.optional = fields, optional
+    def __init__(self, fields, optional=(), others=None):
+        self.fields, self.optional, self.others = fields, optional, others
 
     def check(self, value, where):
         if not isinstance(value, dict):
             _refuse(where, value, "an object")
-        for key in value:
-            if key not in self.fields:
+        for key, item in value.items():
+            if key in self.fields:
+                continue
+            if self.others is None:
                 raise ValueError(f"{where} has the unknown field {ascii(key)[:60]}")
+            self.others.check(item, f"{where}.{ascii(key)[1:-1][:60]}")
         for key, spec in self.fields.items():
             if key in value:
                 spec.check(value[key], f"{where}.{key}")

@@ -11,9 +11,9 @@ from ..directions import parse_directions
 from ..errors import SettingsError
 from ..lighting.emission import emission_of
 from ..lighting.local import arrival, hull_warning
-from ..system.schema import Anything, Flag, MapOf, Record, Text
+from ..system.schema import Flag, ListOf, Number, Record, Text
 from .ledger import Entry
-from .transport import COMPONENTS, TRANSPORTS, Transport
+from .transport import COMPONENTS, TRANSPORTS, Transport, report_spec
 
 
 @TRANSPORTS.register
@@ -165,10 +165,9 @@ class DistantTransport(Transport):
             knob = "paths_per_point"
             what = "noise of reflected light"
             entries.append(Entry("distant: rays", what, rays, "transport", "measured", knob))
-        left = self.report.get("bounce_energy_left")
-        if left:
+        left, energy = self.report.get("bounce_energy_left"), sum(self.report["bounce_energy"])
+        if left and energy > 0:
             what = "reflections after the last one that counts"
-            energy = sum(self.report["bounce_energy"])
             entries.append(
                 Entry("distant: bounces", what, left / energy, "all light", "bound", "bounces")
             )
@@ -188,21 +187,21 @@ class DistantTransport(Transport):
     @classmethod
     def header_spec(cls):
         """See `Transport.header_spec`."""
-        return Record(
-            {
-                "directions": Text(),
-                "basis": Text(),
-                "keeps_direct": Flag(),
-                "report": MapOf(Anything()),
-            }
+        report = report_spec(
+            ("captured_variance", "relative_error"), ("indirect_noise", "bounce_energy_left")
         )
+        more = {
+            "rays_per_direction": Number(1, 1 << 20, whole=True),
+            "bounce_energy": ListOf(Number(-1e30, 1e30)),
+        }
+        report = Record({**report.fields, **more}, report.optional, report.others)
+        fields = {"directions": Text(), "basis": Text(), "keeps_direct": Flag(), "report": report}
+        return Record(fields)
 
     @classmethod
     def shapes(cls, header):
         """See `Transport.shapes`."""
         basis, channels = BASES[header["basis"]], header["report"].get("channels", 1)
-        if channels not in (1, 3):
-            raise ValueError(f"transport of {channels!r} channels")
         sets = {"total": channels} | ({"direct": 1} if header["keeps_direct"] else {})
         found = {}
         for name, count in sets.items():
@@ -235,10 +234,7 @@ class DistantTransport(Transport):
                 if key.startswith(f"{name}/")
             }
             basis = kind(**{key: own[f"basis/{key}"] for key in kind.ARRAYS})
-            stored = next(a for key, a in own.items() if key.startswith("basis/"))
-            s = getattr(basis, "sqrt_weights", stored).shape[-1]
-            if s != len(directions):
-                raise ValueError(f"a basis of {s} directions on {directions}")
+            basis.check_stored(directions)
             return Compressed(basis, kind.unpack(own, points.normals, len(directions)))
 
         direct = part("direct") if header["keeps_direct"] else None

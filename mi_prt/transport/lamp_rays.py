@@ -6,10 +6,10 @@ from ..scene.materials import facing, reflectance_at
 from ..system.runtime import mitsuba
 from .bits import LANES, RAY_OFFSET
 from .hops import HOP, NOTHING
-from .lamps import averaging
+from .lamp_table import averaging
 from .sequences import scrambled_place, shuffled
 
-AIMED = 8  # most shadow rays from each place that a ray meets
+AIMED = 4  # most shadow rays from each place that a ray meets
 # share of all lamps alike in the chance by which one is chosen at a place; the rest goes by their
 # direct light at a point beside it
 ALIKE = 0.4
@@ -48,16 +48,18 @@ class LampRays:
         mi = mitsuba()
         self._scene, self._lamps, self._locator = scene, lamps, locator
         self._count, self._k, self._rays = len(points), len(lamps), rays
-        self._origins = mi.Float(points.ray_origins(RAY_OFFSET * scene.scale).ravel())
+        inset = np.float32(RAY_OFFSET * scene.scale) * points.insets
+        self._positions = mi.Float((points.positions + inset).ravel())
+        self._geometric = mi.Float(points.geometric_normals.ravel())
         self._normals = mi.Float(points.normals.ravel())
         self._direct = mi.Float(np.ascontiguousarray(direct, np.float32).ravel())
         self._offset = dr.opaque(mi.Float, RAY_OFFSET * scene.scale)
         self._seed = dr.opaque(mi.UInt32, seed % (1 << 32))
-        self._aimed = aimed if self._k > aimed else None
-        if self._aimed is not None:
+        self._aimed = aimed if self._k > aimed else 0  # 0: all of them
+        if self._aimed:
             self._chances = mi.Float(_chances(direct).ravel())
         # of one wavefront each: rays, and the sums of lamps
-        widest = max(rays, 2 * self._k if self._aimed is None else 6 * self._k * aimed)
+        widest = max(rays, 6 * self._k * aimed if self._aimed else 2 * self._k)
         self._step = max(1, lanes // widest)
 
     def blocks(self, kept):
@@ -98,7 +100,11 @@ class LampRays:
         place = scrambled_place(ray_number >> 1, sequence)
         normal = dr.gather(mi.Normal3f, self._normals, point)
         direction = mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(place))
-        ray = mi.Ray3f(dr.gather(mi.Point3f, self._origins, point), direction)
+        # A ray that dips below the faces around its point (the hemisphere of a smooth normal can)
+        # starts behind them, as it does in Mitsuba's own rendering.
+        geometric = dr.gather(mi.Normal3f, self._geometric, point)
+        away = dr.mulsign(geometric, dr.dot(geometric, direction)) * self._offset
+        ray = mi.Ray3f(dr.gather(mi.Point3f, self._positions, point) + away, direction)
         surfaces = self._scene.surfaces
         pi = self._scene.occluders.ray_intersect_preliminary(ray)
         si = pi.compute_surface_interaction(ray, mi.RayFlags.All)
@@ -128,7 +134,7 @@ class LampRays:
         """Irradiance (2, 3, b, k) after one reflection, by either half of the rays."""
         sums = (
             self._of_each(met, first, size)
-            if self._aimed is None
+            if not self._aimed
             else self._of_chosen(met, first, size)
         )
         return sums * np.float32(2 / self._rays)
@@ -160,7 +166,7 @@ class LampRays:
 
         mi = mitsuba()
         index = met[0]
-        lane = dr.arange(mi.UInt32, self._aimed * 2 * size)  # pyright: ignore[reportOptionalOperand]
+        lane = dr.arange(mi.UInt32, self._aimed * 2 * size)
         size_ = dr.opaque(mi.UInt32, size)
         k, slots = dr.opaque(mi.UInt32, self._k), dr.opaque(mi.UInt32, self._aimed)
         column = lane // size_  # half by half, slot by slot
@@ -189,7 +195,7 @@ class LampRays:
 
         dr.while_loop((column & 1,), lambda number: number < rays, add)
         dr.eval(sums)
-        sums = np.array(sums).reshape(self._aimed, 2, size, self._k, 3)  # pyright: ignore[reportArgumentType]
+        sums = np.array(sums).reshape(self._aimed, 2, size, self._k, 3)
         return sums.sum(axis=0).transpose(0, 3, 1, 2)
 
     def _lamp_at(self, row, draw):

@@ -24,7 +24,8 @@ from .interreflection import (
     check_ending,
 )
 from .lamp_rays import AIMED, LampRays
-from .lamps import Lamps, relative_noise
+from .lamp_table import Lamps
+from .lamps import relative_noise
 
 RAYS = 256  # of each point
 HOP_RAYS = 64  # of those that are kept, for second reflections and later ones
@@ -106,7 +107,7 @@ def reflected_light(
     Raises
     ------
     LightError
-        See `lamps.Lamps`.
+        See `lamp_table.Lamps`.
     SettingsError
         If `rays` is not a positive multiple of 4.
     SceneError
@@ -121,7 +122,7 @@ def reflected_light(
         scene, points, Lamps(scene, emitters), direct, locator, rays, aimed, seed, lanes
     )
     kept = min(HOP_RAYS, rays)
-    store = _InMemory(n, kept * HOP.itemsize) if hop_rows is None else hop_rows(n, kept)
+    store = (_InMemory if hop_rows is None else hop_rows)(n, kept * HOP.itemsize)
     gather = np.empty((2, 3, n, k), np.float32)
     for block, hops, gathered in sampler.blocks(kept):
         store.append(hops)

@@ -1,27 +1,24 @@
 """Direct light of a scene's own lamps at its points, by shadow rays over the whole of each lamp."""
 
-# Mitsuba's stubs know nothing of what a pointer to an emitter or a register array can do.
-# pyright: reportAttributeAccessIssue=false, reportIndexIssue=false
-
 from dataclasses import dataclass
 
 import numpy as np
 
-from ..errors import LightError
 from ..system.runtime import mitsuba
 from .bits import LANES, RAY_OFFSET
+from .lamp_table import Lamps
 from .sequences import scrambled_place
 
-TOLERANCE = 0.01  # standard error that is aimed at, as a share of the irradiance
+# Standard error that is aimed at, as a share of the irradiance. Doubling ends early where the error
+# looks small by chance, so that the RMS of what is left is about that much.
+TOLERANCE = 0.01
 # share of a lamp's mean irradiance below which a point's error is measured against that share
 DIM = 0.05
-GROUPS = 4  # sequences of each point and lamp; their spread is the error
+GROUPS = 8  # sequences of each point and lamp; their spread is the error
 PILOT = 8  # samples of each sequence before the first look at the error
 MOST_SAMPLES = 1024  # of each point and lamp, all sequences together
 MEAN_POINTS = 1024  # that tell the mean irradiance of a lamp
-NEAR = 1.0  # squared distance to a lamp, over its area, below which rays of the hemisphere help
 HEMISPHERE = 0x5BD1E995  # makes of a sequence another
-SHADOW_END = 1e-4  # share of the way to a lamp by which shadow rays end before it
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,8 +30,8 @@ class DirectLight:
     irradiance : (n, k, 3) float32
         W/m².
     standard_error : (n, k) float32
-        Of the irradiance, norm over the channels; of a point by itself uncertain, as four sequences
-        tell it.
+        Of the irradiance, norm over the channels, from eight sequences. Doubling ends where it
+        looks small, so that in the mean it is a few percent too small.
     rays : int
         Shadow rays traced.
     """
@@ -52,156 +49,6 @@ class DirectLight:
             The points' shares in the mean.
         """
         return relative_noise(self.irradiance, self.standard_error, weights)
-
-
-class Lamps:
-    """Local emitters of a scene by number, in Dr.Jit.
-
-    One kernel serves all of them: which emitter a lane samples is data.
-
-    Parameters
-    ----------
-    scene : Scene
-        Whose shapes cast shadows.
-    emitters : sequence of mi.Emitter
-
-    Raises
-    ------
-    LightError
-        If one is distant, or its light cannot be sampled from a point (it is named).
-    """
-
-    def __init__(self, scene, emitters):
-        import drjit as dr
-
-        mi = mitsuba()
-        for emitter in emitters:
-            _check(emitter)
-        ids = [dr.reinterpret_array(mi.UInt32, mi.EmitterPtr(e))[0] for e in emitters]
-        self._ids = mi.UInt32(np.array(ids, np.uint32))
-        self._occluders = scene.occluders
-        self._offset = dr.opaque(mi.Float, RAY_OFFSET * scene.scale)
-        # whether a lamp is a place without extent, to which one ray is exact
-        self.are_places = np.array([_is_place(e) for e in emitters], bool)
-
-        self._boxes = np.array([_box(e) for e in emitters], np.float32).reshape(-1, 2, 3)
-        self._areas = np.array([_area(e) for e in emitters], np.float32)
-        self._box_of = mi.Float(self._boxes.ravel())
-        self._area_of = mi.Float(self._areas)
-
-    def __len__(self):
-        return len(self.are_places)
-
-    def near(self, lamp, positions, factor=NEAR):
-        """Whether positions (p, 3) are nearer to the boxes around lamps (p,) than their size: the
-        squared distance is below `factor` times the area.
-        """
-        low, high = self._boxes[lamp].swapaxes(0, 1)
-        beside = positions - np.clip(positions, low, high)
-        return np.einsum("ij,ij->i", beside, beside) < factor * self._areas[lamp]
-
-    def near_at(self, lamp, position, factor):
-        """The same in Dr.Jit."""
-        import drjit as dr
-
-        mi = mitsuba()
-        low = dr.gather(mi.Point3f, self._box_of, 2 * lamp)
-        high = dr.gather(mi.Point3f, self._box_of, 2 * lamp + 1)
-        beside = position - dr.clip(position, low, high)
-        return dr.squared_norm(beside) < factor * dr.gather(mi.Float, self._area_of, lamp)
-
-    def aimed(self, lamp, origin, normal, place, active=True):
-        """One sample of a lamp, aimed at from points: what would arrive without shadows.
-
-        Parameters
-        ----------
-        lamp : mi.UInt32
-        origin : mi.Point3f
-            Off the surface: where the shadow ray starts.
-        normal : mi.Normal3f
-        place : mi.Point2f
-            On the lamp, in the unit square.
-        active : mi.Bool
-
-        Returns
-        -------
-        sample : mi.DirectionSample3f
-        weight : mi.Color3f
-            Radiance over density; irradiance of a place at right angles. 0 where nothing arrives.
-        cosine : mi.Float
-            To the normal.
-        """
-        import drjit as dr
-
-        mi = mitsuba()
-        sample, weight = self.emitter(lamp, active).sample_direction(_seen(origin), place, active)
-        cosine = dr.dot(normal, sample.d)
-        weight = mi.Color3f(weight)
-        # a lamp in the point itself has no direction
-        arrives = mi.Bool(active) & (cosine > 0) & dr.isfinite(dr.sum(weight))
-        return sample, dr.select(arrives, weight, 0), cosine
-
-    def visible(self, origin, sample, active):
-        """Whether nothing stands between points and a sample of a lamp."""
-        import drjit as dr
-
-        ray = mitsuba().Ray3f(origin, sample.d)
-        ray.maxt = dr.maximum(sample.dist * (1 - SHADOW_END) - self._offset, 0)
-        return mitsuba().Bool(active) & ~self._occluders.ray_test(ray, active)
-
-    def met(self, lamp, origin, direction):
-        """Radiance of a lamp along rays, and the density with which `aimed` takes them.
-
-        Returns
-        -------
-        radiance : mi.Color3f
-            0 where something else is met.
-        density : mi.Float
-            Per steradian.
-        """
-        import drjit as dr
-
-        mi = mitsuba()
-        emitter = self.emitter(lamp)
-        si = self._occluders.ray_intersect(mi.Ray3f(origin, direction))
-        hit = si.is_valid() & (si.shape.emitter() == emitter)
-        sample = mi.DirectionSample3f(self._occluders, si, _seen(origin))
-        density = emitter.pdf_direction(_seen(origin), sample, hit)
-        radiance = mi.Color3f(emitter.eval(si, hit))
-        return dr.select(hit & (density > 0), radiance, 0), density
-
-    def emitter(self, lamp, active=True):
-        """The emitters (mi.EmitterPtr) of these numbers."""
-        import drjit as dr
-
-        mi = mitsuba()
-        return dr.reinterpret_array(mi.EmitterPtr, dr.gather(mi.UInt32, self._ids, lamp, active))
-
-
-def _seen(origin):
-    import drjit as dr
-
-    mi = mitsuba()
-    it = dr.zeros(mi.Interaction3f, dr.width(origin))
-    it.p = origin
-    return it
-
-
-def averaging(cosine, distance, footprint):
-    """Mean of the irradiance by a place over a footprint, as a multiple of that in its middle.
-
-    A place at the height h over a plane lights it with I·h/(ρ² + h²)^(3/2) at the distance ρ beside
-    it, 2πI in all for any h. Raised over the footprint as in `examples.raised_height`, it lights a
-    spot of the footprint's size with the same power.
-    """
-    import drjit as dr
-
-    from .examples import raised_height
-
-    height, squared = cosine * distance, dr.square(distance)
-    raised = raised_height(height, footprint)
-    spread = (squared - dr.square(height) + dr.square(raised)) / squared
-    return raised / height * dr.rsqrt(spread) / spread
 
 
 def direct_light(
@@ -224,10 +71,10 @@ def direct_light(
         Local emitters of the scene: point, spot, projector, and area on any shape.
     tolerance : float
         Standard error that is aimed at, as a share of the irradiance of a lamp at a point, or of
-        `DIM` times its mean where the point receives less. Samples are doubled from 32 on until it
+        `DIM` times its mean where the point receives less. Samples are doubled from 64 on until it
         is met.
     most_samples : int
-        Where doubling ends; a power of two ≥ 32.
+        Where doubling ends; a power of two ≥ 64.
     seed : int
     lanes : int
         Most lanes of one wavefront. Results do not depend on it.
@@ -288,13 +135,16 @@ class _DirectSampler:
         self.rays = 0
 
     def means(self):
-        """Mean norm (k,) of each lamp's irradiance over some of the points, by the pilot."""
+        """Mean norm (k,) of each lamp's irradiance over some of the points, by the pilot; 0 of
+        those without extent, which need no samples.
+        """
         k = len(self._lamps)
+        extended = np.flatnonzero(~self._lamps.are_places)
         chosen = np.linspace(0, self._count - 1, min(MEAN_POINTS, self._count)).astype(int)
         total = np.zeros(k)
         step = max(1, self._lanes // (GROUPS * len(chosen)))
-        for first in range(0, k, step):
-            some = np.arange(first, min(first + step, k))
+        for first in range(0, len(extended), step):
+            some = extended[first : first + step]
             point, lamp = np.tile(chosen, len(some)), np.repeat(some, len(chosen))
             value = self._sums(point, lamp, 0, PILOT)[..., :3].mean(axis=1) / PILOT
             total[some] = np.linalg.norm(value, axis=1).reshape(len(some), -1).mean(axis=1)
@@ -382,36 +232,3 @@ def _mean_and_error(groups):
     count = groups.shape[1]
     squares = np.square(groups - mean[:, None]).sum(axis=(1, 2))
     return mean, np.sqrt(squares / (count * (count - 1)))
-
-
-def _box(emitter):
-    """Corners (2, 3) of the box around an emitter's shape; 0 without one."""
-    shape = emitter.get_shape()
-    if shape is None:
-        return np.zeros((2, 3))
-    box = shape.bbox()
-    return np.array([box.min, box.max], dtype=np.float64).reshape(2, 3)
-
-
-def _area(emitter):
-    """Of an emitter's shape, m²; 0 without one."""
-    shape = emitter.get_shape()
-    return 0.0 if shape is None else float(np.array(shape.surface_area()).ravel()[0])
-
-
-def _is_place(emitter):
-    mi = mitsuba()
-    return mi.has_flag(emitter.flags(), mi.EmitterFlags.DeltaPosition)
-
-
-def _check(emitter):
-    mi = mitsuba()
-    shape = emitter.get_shape()
-    name = f"emitter '{emitter.id()}'" if shape is None else f"light of shape '{shape.id()}'"
-    if mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite):
-        raise LightError(f"{name} ({emitter.class_name()}) is distant: its light is no lamp's")
-    if mi.has_flag(emitter.flags(), mi.EmitterFlags.DeltaDirection):
-        raise LightError(
-            f"{name} ({emitter.class_name()}) shines in one direction only, which cannot be aimed"
-            " at from a point: use an area light or a spot instead, or remove it"
-        )

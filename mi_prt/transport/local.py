@@ -10,13 +10,13 @@ from ..directions.hemisphere import Hemisphere
 from ..lighting.emission import emission_of
 from ..points.clusters import Clusters
 from ..system.parallel import one_blas_thread
-from ..system.schema import Anything, Flag, MapOf, Number, Record, Text
+from ..system.schema import Flag, Number, Record, Text
 from .depth import DepthBuffers
 from .ledger import Entry
 from .local_direct import LocalDirect
 from .local_storage import DEPTH_SHAPES, pack_depth, pack_transfer, transfer_shapes, unpack
 from .transfer_matrix import Transfer
-from .transport import TRANSPORTS, Transport
+from .transport import CHANNELS, TRANSPORTS, Transport, report_spec
 
 
 @TRANSPORTS.register
@@ -73,10 +73,10 @@ class LocalTransport(Transport):
 
     def _direct_light(self, points):
         """The LocalDirect of the points; what it holds in Dr.Jit is made once."""
-        if id(points) not in self._direct:
-            self._direct.clear()
-            self._direct[id(points)] = LocalDirect(points, self.clusters, self.depth)
-        return self._direct[id(points)]
+        if self._direct.get("points") is not points:
+            made = LocalDirect(points, self.clusters, self.depth)
+            self._direct.update(points=points, kernel=made)
+        return self._direct["kernel"]
 
     def _indirect(self, averaged):
         """Indirect irradiance (n, 3); what compression leaves of it below zero is zero."""
@@ -141,9 +141,11 @@ class LocalTransport(Transport):
                 "quantize": Text("16", "none"),
                 "extent": Number(1e-30, 1e30),
                 "reflects": Flag(),
-                "channels": Number(1, 3, whole=True),
+                "channels": CHANNELS,
                 "sparse": Flag(),
-                "report": MapOf(Anything()),
+                "report": report_spec(
+                    ("misclassified_visibility",), ("direct_error", "transfer_error")
+                ),
             }
         )
 

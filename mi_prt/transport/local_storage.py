@@ -12,7 +12,7 @@ from .transfer_matrix import Transfer
 # all values
 _SPARSE_BELOW = 0.5
 # Memory of a matrix that a file may ask for: so many bytes, and so many times what it holds itself.
-MOST_BYTES, MOST_SPARSE = 150_000_000, 50
+MOST_BYTES, MOST_SPARSE = 40_000_000, 50
 
 
 def _shapes(name, shape, bits, scale):

@@ -12,9 +12,9 @@ import numpy as np
 
 from ..errors import LightError
 from ..system.parallel import one_blas_thread
-from ..system.schema import Anything, Array, ListOf, MapOf, Record, Text
+from ..system.schema import Array, ListOf, Nothing, Number, OneOf, Record, Text
 from .ledger import Entry
-from .transport import TRANSPORTS, Transport
+from .transport import TRANSPORTS, Transport, report_spec
 
 LARGEST_HALF = 3e4  # what the largest number of a column is in 16 bits
 
@@ -127,8 +127,8 @@ class OwnTransport(Transport):
     def ledger(self):
         """See `Transport.ledger`."""
         known = (
-            ("direct_noise", "noise of shadow rays", "lamp_samples"),
-            ("indirect_noise", "noise of reflected light", "lamp_paths"),
+            ("direct_noise", "noise of shadow rays", "lamp_tolerance"),
+            ("indirect_noise", "noise of reflected light", "lamp_rays"),
         )
         return [
             Entry("own: rays", what, self.report[key], "irradiance", "measured", knob)
@@ -145,12 +145,13 @@ class OwnTransport(Transport):
     @classmethod
     def header_spec(cls):
         """See `Transport.header_spec`."""
-        lamp = Record({"name": Text(), "kind": Text(), "digest": Text(), "strength": Anything()})
+        strength = OneOf(Nothing(), ListOf(Number(0, 1e30), 3))
+        lamp = Record({"name": Text(), "kind": Text(), "digest": Text(), "strength": strength})
         return Record(
             {
                 "lamps": ListOf(lamp),
                 "quantize": Text("16", "none"),
-                "report": MapOf(Anything()),
+                "report": report_spec(optional=("direct_noise", "indirect_noise")),
             }
         )
 
@@ -180,6 +181,9 @@ class OwnTransport(Transport):
     @classmethod
     def from_arrays(cls, header, arrays, points):
         """See `Transport.from_arrays`."""
+        names = [lamp["name"] for lamp in header["lamps"]]
+        if len(set(names)) < len(names):
+            raise ValueError("transports.own.lamps repeat a name")
         columns = []
         for name in ("direct", "indirect"):
             values = np.asarray(arrays[name], np.float32)

@@ -9,9 +9,30 @@ from typing import Any, ClassVar
 
 from ..errors import SettingsError
 from ..system.registry import Registry
+from ..system.schema import Anything, Number, OneOf, Record, Text
 
 TRANSPORTS = Registry("transport", "mi_prt.transport")
 COMPONENTS = ("total", "direct", "indirect")
+CHANNELS = OneOf(Number(1, 1, whole=True), Number(3, 3, whole=True))
+BOUNCES = OneOf(Number(0, 1 << 31, whole=True), Text("auto"))
+
+
+def report_spec(required=(), optional=()):
+    """What the report of a transport must be in files.
+
+    Parameters
+    ----------
+    required, optional : tuple of str
+        Names of numbers that are computed with. All else is shown only.
+
+    Returns
+    -------
+    Record
+    """
+    number = Number(-1e30, 1e30)
+    fields = dict.fromkeys((*required, *optional), number)
+    fields |= {"bounces": BOUNCES, "channels": CHANNELS}
+    return Record(fields, ("channels", *optional), Anything())
 
 
 @dataclass(frozen=True)
@@ -31,7 +52,7 @@ class Question:
     Raises
     ------
     SettingsError
-        If the component is another.
+        If the component is another, or `nearest` below 1.
     """
 
     light: Any
@@ -42,6 +63,10 @@ class Question:
         if self.component not in COMPONENTS:
             raise SettingsError(
                 f"component '{self.component}' is not known: use {', '.join(COMPONENTS)}"
+            )
+        if self.nearest < 1:
+            raise SettingsError(
+                f"the number of nearest directions must be at least 1, got {self.nearest}"
             )
 
 
