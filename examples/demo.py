@@ -1,5 +1,5 @@
-"""The main job on one scene: precompute, relight under a turning sky, draw in two ways, compare
-with Mitsuba; and a lamp that moves inside.
+"""The main job: precompute a scene, relight it under a turning sky, draw in two ways, compare with
+Mitsuba; a room by day, at dusk and at night from one asset; and a lamp that moves.
 
 Usage: python examples/demo.py [--out out/demo] [--frames 24]
 """
@@ -8,20 +8,31 @@ import argparse
 import time
 from pathlib import Path
 
+import numpy as np
 from PIL import Image
 
 import mi_prt
+from mi_prt.evaluate import ground_truth
 from mi_prt.lighting.from_mitsuba import scene_light
 from mi_prt.lighting.to_mitsuba import lit_scene
 from mi_prt.output.film import light_path
 from mi_prt.output.moving import animate
 from mi_prt.render.display import display, exposure
 from mi_prt.render.image import render_image, resized
+from mi_prt.render.image_file import write_displayed
+from mi_prt.render.picture import Picture
 from mi_prt.scene.scene import open_scene
 
 ROOT = Path(__file__).resolve().parent.parent
 SCENE = ROOT / "scenes" / "still_life.xml"
+DAY_ROOM = ROOT / "scenes" / "day_room.xml"
 ROOM = ROOT / "scenes" / "room.xml"
+LAMPS = ("ceiling_lamp", "floor_lamp", "desk_lamp")
+HOURS = {  # its own light: what shines, and how bright it is
+    "day": ["scene:sky"],
+    "dusk": ["scene:sky*0.05", *(f"scene:{lamp}" for lamp in LAMPS)],
+    "night": ["scene:ceiling_lamp*0.1", "scene:floor_lamp", "scene:desk_lamp"],
+}
 WALK = "1.6,1.7,1.6 -0.6,1.7,1.5 0.1,1.6,0.2 0.1,1.6,-1.4 -1.6,1.7,-1.8"  # through the doorway
 FRAME_SIZE = (400, 300)
 
@@ -63,7 +74,10 @@ def main():
         f" {errors['reference_noise']:.2%}), bias {errors['bias']:+.2%}, PSNR {errors['psnr']:.1f}"
         f" dB, FLIP {errors['flip']:.3f}"
     )
-    say(f"5. carry a lamp through the two rooms of {ROOM.name}")
+    say(f"5. {DAY_ROOM.name} by day, at dusk and at night, from one asset")
+    hours = arguments.out / "hours.png"
+    day_to_night(hours)
+    say(f"6. carry a lamp through the two rooms of {ROOM.name}")
     walk = arguments.out / "walk.gif"
     carried_lamp(walk, arguments.frames)
     say(f"done in {time.perf_counter() - started:.0f} s")
@@ -73,6 +87,7 @@ def main():
         ("raster image", raster),
         ("comparison, side by side", arguments.out / "report" / "side_by_side.png"),
         ("report page", arguments.out / "report" / "index.html"),
+        ("day, dusk and night; below, Mitsuba", hours),
         ("carried lamp", walk),
     ):
         say(f"  {what}: {path}")
@@ -99,6 +114,31 @@ def turning_sky(asset, path, frames):
         f"   turn, project and relight {len(asset.points):,} points:"
         f" {1e3 * sorted(relighting)[frames // 2]:.1f} ms a frame"
     )
+
+
+def day_to_night(path):
+    """Write pictures of a room under its sky and lamps, relit above, path-traced below."""
+    begun = time.perf_counter()
+    asset = mi_prt.precompute(DAY_ROOM, coefficients=192, rays_per_direction=4)
+    say(
+        f"   {len(asset.points):,} {asset.settings['points']}, transports"
+        f" {', '.join(asset.transports)}, {time.perf_counter() - begun:.0f} s"
+    )
+    scene, rows = open_scene(DAY_ROOM), [[], []]
+    for hour, light in HOURS.items():
+        picture = Picture(asset, scene, asset.resolved(light, scene=scene))
+        begun = time.perf_counter()
+        irradiance = picture.irradiance()
+        seconds = time.perf_counter() - begun
+        with picture.drawn(size=FRAME_SIZE, spp=32) as draw:
+            images = [draw(irradiance)]
+        lit = lit_scene(scene, picture.light, modelled=True)
+        with resized(lit.sensors()[0], FRAME_SIZE) as sensor:
+            images.append(ground_truth.image(lit, sensor, 128, 0, -1).mean)
+        for row, image in zip(rows, images):
+            row.append(display(image, picture.exposure()))
+        say(f"   {hour}: relit in {1e3 * seconds:.0f} ms")
+    write_displayed(path, np.concatenate([np.concatenate(row, axis=1) for row in rows]))
 
 
 def carried_lamp(path, frames):

@@ -1,16 +1,16 @@
 """Light of a scene's own lamps at its points: against closed forms, and against Mitsuba."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from conftest import bias, diffuse, facing, largest_z, mesh, rectangle, relative_l2, scene, sphere
 
 from mi_prt.errors import LightError, SettingsError
 from mi_prt.evaluate import ground_truth
-from mi_prt.points.locate import PatchLocator
 from mi_prt.points.points import sample_points
-from mi_prt.points.samples import scatter_samples
+from mi_prt.points.samples import scatter_points
 from mi_prt.precompute.workspace import RowFile
-from mi_prt.scene.materials import facing as side_of
 from mi_prt.scene.scene import open_scene
 from mi_prt.system.runtime import count_kernels, mitsuba
 from mi_prt.transport.bits import find_buried
@@ -29,43 +29,6 @@ def light_bulb(position, intensity=1.0):
         "position": list(map(float, position)),
         "intensity": {"type": "rgb", "value": intensity},
     }
-
-
-class PatchPicker:
-    """One of the three points around a hit, by their weights."""
-
-    def __init__(self, opened, points, buried):
-        mi = mitsuba()
-        self._locator = PatchLocator(opened, points)
-        self._kept = mi.Float(np.where(buried, 0.0, 1.0).astype(np.float32))
-
-    def picked(self, pi, si, ray, active, random):
-        import drjit as dr
-
-        points, weights, found = self._locator.locate(pi, si, active)
-        kept = [
-            w * dr.gather(mitsuba().Float, self._kept, i, found) for i, w in zip(points, weights)
-        ]
-        total = sum(kept)
-        found &= total > 1e-4
-        draw = random * total
-        last = dr.select(draw < kept[0] + kept[1], points[1], points[2])
-        return dr.select(draw < kept[0], points[0], last), found
-
-
-class NearestPicker:
-    """The nearest sample."""
-
-    def __init__(self, opened, samples):
-        self._locator, self._surfaces = samples.locator(), opened.surfaces
-
-    def picked(self, pi, si, ray, active, random):
-        import drjit as dr
-
-        normals, _, reflects = side_of(si, ray, self._surfaces)
-        active = active & reflects
-        index, distance = self._locator.nearest(si.p, normals.shading, active)
-        return index, active & dr.isfinite(distance)
 
 
 class Lit:
@@ -87,7 +50,7 @@ class Lit:
 
     def reflected(self, direct=None, **options):
         direct = self.direct() if direct is None else direct
-        picker = PatchPicker(self.scene, self.points, self.buried)
+        picker = replace(self.points, buried=self.buried).locator(self.scene)
         return reflected_light(
             self.scene,
             self.points,
@@ -308,7 +271,7 @@ def test_spot_beside_a_wall_has_its_power():
     ceiling = lit.on("ceiling")
     points, buried = lit.points.at(ceiling), lit.buried[ceiling]
     direct = direct_light(lit.scene, points, lit.emitters)
-    picker = PatchPicker(lit.scene, lit.points, lit.buried)
+    picker = replace(lit.points, buried=lit.buried).locator(lit.scene)
     result = reflected_light(
         lit.scene, points, buried, lit.emitters, direct.irradiance, picker, rays=rays, bounces=1
     ).irradiance[:, 0, 0]
@@ -446,26 +409,24 @@ def test_chosen_lamps_have_the_same_mean(room):
 
 def test_samples_serve_as_points(room):
     """Meshless samples in the place of vertices: the mean over the floor agrees within 3 %."""
-    samples, _ = scatter_samples(room.scene, 1000, 500, 10, 0)
+    samples, _, _ = scatter_points(room.scene, 1000, 2, 0)
     buried = np.zeros(len(samples), bool)
-    direct = direct_light(room.scene, samples.points, room.emitters)
+    direct = direct_light(room.scene, samples, room.emitters)
     result = reflected_light(
         room.scene,
-        samples.points,
+        samples,
         buried,
         room.emitters,
         direct.irradiance,
-        NearestPicker(room.scene, samples),
+        samples.locator(room.scene),
         rays=128,
     )
     number = [s.name for s in room.scene.surfaces].index("floor")
-    here = samples.points.surface == number
+    here = samples.surface == number
     there = room.on("floor")
     expected = room.reflected(rays=128).irradiance[there].sum(axis=1)
     mean = np.average(expected, axis=0, weights=room.points.areas[there])
-    found = np.average(
-        result.irradiance[here].sum(axis=1), axis=0, weights=samples.points.areas[here]
-    )
+    found = np.average(result.irradiance[here].sum(axis=1), axis=0, weights=samples.areas[here])
     assert np.abs(found / mean - 1).max() < 0.03
 
 
