@@ -80,7 +80,7 @@ def make_clusters(points, count, seed=0):
     ----------
     points : Points, or what else has positions and normals (n, 3)
     count : int
-        Fewer come back where points are fewer.
+        Fewer come back where fewer points differ in position or normal.
     seed : int
 
     Returns
@@ -88,7 +88,12 @@ def make_clusters(points, count, seed=0):
     Clusters
     """
     positions, normals = points.positions, points.normals
-    roots, radius = thin(positions, normals, min(count, len(positions)), seed)
+    # Meshes that meet may share points; two roots in one place would be one cluster too many.
+    distinct = np.unique(np.hstack([positions, normals]) + 0.0, axis=0, return_index=True)[1]
+    distinct.sort()
+    few = min(count, len(distinct))
+    roots, radius = thin(positions[distinct], normals[distinct], few, seed)
+    roots = distinct[roots]
     tree = cKDTree(embedded(positions[roots], normals[roots], radius))
     label = tree.query(embedded(positions, normals, radius))[1]
     used, label = np.unique(label, return_inverse=True)

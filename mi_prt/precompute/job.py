@@ -124,7 +124,7 @@ class Builder(ABC):
         points = self.job.points
         if not points.layout.buries:
             return np.zeros(len(points), bool)
-        return find_buried(self.job.scene, points, np.ones(len(points), bool))
+        return find_buried(self.job.scene, points)
 
     @abstractmethod
     def build(self):

@@ -137,7 +137,7 @@ class VisibilityTracer:
         return np.packbits(np.array(visible).reshape(-1, self.lanes_per_point), axis=1)
 
 
-def find_buried(scene, points, dark, lanes=LANES):
+def find_buried(scene, points, dark=None, lanes=LANES):
     """Which points without any sky lie inside or against other geometry.
 
     A point is buried when every ray of its hemisphere ends on the back of a face or nearer than
@@ -148,8 +148,9 @@ def find_buried(scene, points, dark, lanes=LANES):
     ----------
     scene : Scene
     points : Points
-    dark : (n,) bool
-        Points that see no direction of the sky.
+    dark : (n,) bool, optional
+        Points that see no direction of the sky, the only ones that can be buried; where that is not
+        known, all are tried.
     lanes : int
         Most rays of one wavefront.
 
@@ -161,7 +162,7 @@ def find_buried(scene, points, dark, lanes=LANES):
 
     mi = mitsuba()
     buried = np.zeros(len(points), bool)
-    index = np.flatnonzero(dark)
+    index = np.arange(len(points)) if dark is None else np.flatnonzero(dark)
     if not len(index):
         return buried
     # A fixed spherical Fibonacci set, flipped into each hemisphere.

@@ -27,12 +27,12 @@ FAR = 0.8  # share of the extent from which on all light is equally far
 # neighbours see past that
 CELLS = 1.0
 NEIGHBOURS = 256  # samples around a place that tell what it stands over
-UNDER = 2.0  # radii that a sample may lie beside a place which stands over it
+UNDER = 2.0  # of a point's spacing, that it may lie beside a place which stands over it
 # share of the way to the nearest surface ahead by which a place may be moved, and as much be
 # tolerated
 ROOM = 0.5
 AHEAD = 0.2  # cosine to the normal of that, from which on other samples are ahead of a place
-ON_SURFACE = 1e-3  # radii of samples from a surface, below which a place is on it
+ON_SURFACE = 1e-3  # of a point's spacing, below which a place is on its surface
 
 
 class LocalDirect:
@@ -50,10 +50,12 @@ class LocalDirect:
 
         mi = mitsuba()
         self._order = clusters.order
-        self._radius = float(np.median(points.layout.spacing(points)))
         points = points.at(clusters.order)
         self._count = len(points)
-        self._tree, self._normals = cKDTree(points.positions), points.normals
+        # A place stands over surfaces that are seen: the floor below a box is not one of them.
+        shown = points.at(~points.buried | points.buried.all())
+        self._tree, self._normals = cKDTree(shown.positions), shown.normals
+        self._spacing = np.full(len(shown), shown.layout.spacing(shown), np.float64)
         self._hemisphere, self._directions = depth.hemisphere, depth.means.shape[1]
         # of four components: gathered in one load
         self._groups = -(-depth.coefficients.shape[1] // 4)
@@ -147,7 +149,7 @@ class LocalDirect:
         """For each place (k, 8): the normal of the surface that it stands over, on its side; how
         far from that it is; and how far it may be moved.
         """
-        k = min(NEIGHBOURS, self._count)
+        k = min(NEIGHBOURS, self._tree.n)
         distance, near = (
             x.reshape(len(emission), -1)
             for x in self._tree.query(emission.positions, k, workers=-1)
@@ -159,11 +161,12 @@ class LocalDirect:
         beside = np.sqrt(np.maximum(distance**2 - height**2, 0))
         # Not just the nearest sample: outside an edge of a room that is one of a wall that the
         # place does not stand over.
-        under = np.argmin(np.where(beside < UNDER * self._radius, distance, np.inf), axis=1)
+        spacing = self._spacing[near]
+        under = np.argmin(np.where(beside < UNDER * spacing, distance, np.inf), axis=1)
         row = np.arange(len(emission))
-        normal, height = normals[row, under], height[row, under]
+        normal, height, spacing = normals[row, under], height[row, under], spacing[row, under]
         # A place on a surface that shines to one side stands on that side.
-        on_surface = (np.abs(height) < ON_SURFACE * self._radius) & (emission.cosine > 0)
+        on_surface = (np.abs(height) < ON_SURFACE * spacing) & (emission.cosine > 0)
         side = np.where(on_surface, np.einsum("ij,ij->i", emission.axes, normal), height)
         away = np.where(side < 0, -1, 1)[:, None] * normal
         ahead = (
