@@ -263,6 +263,37 @@ def test_info_of_a_scene_and_of_an_asset(scene, asset, capsys):
     )
 
 
+def test_info_names_lights_and_says_what_they_call_for(capsys):
+    """A room with a window and three lamps: its sky and its lamps are built, with the reason."""
+    arguments = ("info", SCENES / "day_room.xml", "--edge-length", "1", "--directions", "cubemap:4")
+    code, out, _ = run(capsys, *arguments, "--json")
+    found = json.loads(out)
+    assert code == 0
+    names = {light["name"]: light["distant"] for light in found["lights"]}
+    assert names == {"sky": True, "ceiling_lamp": False, "floor_lamp": False, "desk_lamp": False}
+    chosen = found["settings"]["transports"]
+    assert chosen["value"] == "distant,own" and "3 lamps" in chosen["reason"]
+    assert found["left_out"] == []
+    predicted = found["predicted"]
+    assert set(predicted["transports"]) == {"distant", "own"}
+    assert all(part["seconds"] >= 0 for part in predicted["transports"].values())
+    code, out, _ = run(capsys, *arguments)
+    assert code == 0 and "name ceiling_lamp" in out and "3 lamps" in out
+
+
+@pytest.mark.parametrize("command", ["doctor", "info", "precompute", "relight", "compare"])
+def test_help_is_whole(command, capsys):
+    """What stands in brackets is shown, not taken for markup, and forms of lights are not cut."""
+    code, out, _ = run(capsys, command, "--help")
+    words = " ".join(out.replace("│", " ").split())
+    assert code == 0 and f"mi-prt {command}" in words and "…" not in words.replace("x,y,z …", "")
+    if command in ("info", "precompute"):
+        assert "[auto: until 0.1 % is left; with the bases haar and none: 0]" in words
+        assert "[auto]" in words and "[cubemap:32]" in words
+    if command in ("relight", "compare"):
+        assert "spot:x,y,z:dx,dy,dz:r,g,b[:cutoff[:beam]]" in words
+
+
 def test_what_info_predicts_is_what_precompute_needs(scene, tmp_path, capsys):
     """Points and rays are counted, not guessed, so they agree exactly; bytes to 20 % (the
     container's own overhead).

@@ -16,10 +16,9 @@ from .reflections import surface_shares
 LANE_BYTES = 400  # of rays that are followed to surfaces and from there to lamps
 LEAST_LANES = 1 << 16
 COLUMN_BYTES = 100  # of a point and lamp, while columns are put together
-PROBE_POINTS = 512
+PROBE_POINTS = 512, 4096  # points of two probes: their difference is free of what each call takes
+PROBE_RAYS = 16
 ALL = 1 << 20  # in the place of a number of reflections: any number
-# rays for reflections that take as long as direct light, about
-REFLECTED_RAYS = 64
 
 
 @BUILDERS.register
@@ -98,8 +97,10 @@ class OwnBuilder(Builder):
         noise = found.noise(surface_shares(points, points.buried))
         return np.concatenate([found.irradiance, _row(noise)])
 
-    def _reflected(self, direct):
-        """Reflected irradiance (n, k, 3) of the lamps, and in one more row what is reported."""
+    def _reflected(self, direct, rays=None):
+        """Reflected irradiance (n, k, 3) of the lamps, and in one more row what is reported; by so
+        many rays from each point, or as many as the settings say.
+        """
         job, settings = self.job, self.job.settings
         bounces = settings.lamp_bounces
         found = reflected_light(
@@ -109,7 +110,7 @@ class OwnBuilder(Builder):
             self._emitters,
             direct,
             job.points.locator(job.scene),
-            settings.lamp_rays,
+            rays or settings.lamp_rays,
             None if bounces == "auto" else bounces,
             seed=settings.seed,
             lanes=self._lanes,
@@ -123,24 +124,43 @@ class OwnBuilder(Builder):
     # --- forecast -----------------------------------------------------------------------------
 
     def forecast(self):
-        """See `Builder.forecast`: some of the points are lit."""
-        job, settings = self.job, self.job.settings
-        n, k = len(job.points), len(self._lights)
-        index = np.random.default_rng(settings.seed).permutation(n)[:PROBE_POINTS]
-        few = job.points.at(np.sort(index))
-        self._direct(few)  # compiles the kernels
-        started = time.perf_counter()
-        self._direct(few)
-        seconds = (time.perf_counter() - started) * n / len(few)
+        """See `Builder.forecast`: some of the points are lit, and all of them by few rays."""
+        settings, n, k = self.job.settings, len(self.job.points), len(self._lights)
         width = 12 if settings.quantize == "16" else 24
         return {
-            "seconds": round(seconds * (1 + settings.lamp_rays / REFLECTED_RAYS), 1),
+            "seconds": round(self._direct_seconds() + self._reflected_seconds(), 1),
             "bytes": width * n * k,
             "memory": LANES * LANE_BYTES // 4 + COLUMN_BYTES * n * k,
             "requires": {},
             "chosen": {},
             "reasons": {"lamp_tolerance": "shadow rays go on until their noise is below it"},
         }
+
+    def _direct_seconds(self):
+        points = self.job.points
+        order = np.random.default_rng(self.job.settings.seed).permutation(len(points))
+        few, more = (points.at(np.sort(order[:count])) for count in PROBE_POINTS)
+        self._direct(few)  # compiles the kernels
+        fewer, seconds = (_seconds(lambda part=part: self._direct(part)) for part in (few, more))
+        if len(more) == len(points):
+            return seconds
+        each = max(seconds - fewer, 0) / (len(more) - len(few))
+        return seconds + each * (len(points) - len(more))
+
+    def _reflected_seconds(self):
+        settings = self.job.settings
+        if settings.lamp_bounces == 0:
+            return 0.0
+        rays = min(PROBE_RAYS, settings.lamp_rays)
+        lit = np.ones((len(self.job.points), len(self._lights), 3), np.float32)
+        self._reflected(lit, 4)  # compiles the kernels
+        return _seconds(lambda: self._reflected(lit, rays)) * settings.lamp_rays / rays
+
+
+def _seconds(run):
+    started = time.perf_counter()
+    run()
+    return time.perf_counter() - started
 
 
 def _lamp(light):
