@@ -36,7 +36,7 @@ from .output.relight import relight_to_file
 from .precompute.precompute import precompute
 from .render.integrator import register_integrator
 
-__version__ = "0.4.0"
+__version__ = "0.5.0"
 __all__ = [
     "AreaLight",
     "Asset",

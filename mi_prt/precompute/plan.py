@@ -84,7 +84,12 @@ def _points(scene, asked, given, transports):
     for name in given:
         if BY_NAME[name].group in ("vertices", "samples"):
             return BY_NAME[name].group, f"{name} was given"
-    return "vertices", "they show edges of shadows and small things best at equal number"
+    if "own" in transports or "local" in transports:
+        return "samples", (
+            "the scene has lamps, as rooms have: points spread evenly over what light can reach"
+            " carry reflections between walls better than vertices of small things"
+        )
+    return "vertices", "light comes from afar: vertices show edges of shadows and small things best"
 
 
 def _foreign(name, group, points, transports):
