@@ -335,8 +335,8 @@ def sky_morning() -> np.ndarray:
         horizon=(4.2, 4.6, 5.0),
         ground=(1.3, 1.25, 1.0),
         glow=(2.6, 2.2, 1.5),
-        sun=(850.0, 720.0, 530.0),
-        sun_width=3.0,
+        sun=(212.5, 180, 132.5),
+        sun_width=6.0,
     )
 
 

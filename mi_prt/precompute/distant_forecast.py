@@ -186,5 +186,5 @@ def _coefficients_reason(settings):
             f" {AUTO_COEFFICIENTS}"
         )
     if settings.coefficients is None:
-        return "so many relight in about a millisecond; more of them sharpen shadows"
+        return "so many relight in a few milliseconds; more of them sharpen shadows"
     return "as asked"

@@ -106,7 +106,7 @@ OPTIONS = (
     Integer(
         "coefficients",
         None,
-        "Components of the basis [48 (sh: 49), or the rank if lower].",
+        "Components of the basis [96 (sh: 49), or the rank if lower].",
         "D|auto",
         "distant",
         others=(None, "auto"),
