@@ -372,7 +372,7 @@ def test_patches_that_do_not_fit_are_refused(vertices, name):
     "report", [{}, *({"radius": r} for r in (0.0, -1.0, 1, "1", True, None, [], 1e300, np.nan))]
 )
 def test_a_radius_that_is_none_is_refused(report):
-    with pytest.raises(ValueError, match="radius is .*no positive number"):
+    with pytest.raises(ValueError, match="points.report.radius"):
         LAYOUTS["spacing"].from_arrays({}, report)
 
 
