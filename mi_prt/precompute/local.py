@@ -200,7 +200,8 @@ class LocalBuilder(Builder):
         left, _, _ = leading_components(responses, RECEIVERS, self.job.settings.seed)
         receivers = np.zeros((m, RECEIVERS), np.float32)
         receivers[:, : left.shape[1]] = left
-        surface = np.isfinite(seen.distance)
+        buried = self.job.points.buried[self._clusters.order[cluster]]
+        surface = np.isfinite(seen.distance) & ~buried[:, None]
         missed = (surface & (seen.sample == NOTHING)).sum()
         return [
             receivers,
