@@ -67,8 +67,8 @@ class Asset:
         rotate : (axis, degrees), optional
             Turns the distant light.
         scene : Scene, path, dict or mi.Scene, optional
-            Needed where the light contains distant light of the scene, and only then opened; by
-            default where it was.
+            Needed where the light contains distant light of the scene, or lamps whose light is not
+            baked, and only then opened; by default where it was.
 
         Returns
         -------
@@ -88,6 +88,8 @@ class Asset:
         names = {emitter["name"]: emitter["distant"] for emitter in self.emitters}
         opened = scene if scene_is_open(scene) else lambda: open_scene_of(self, scene)
         light = resolve(light, opened, names)
+        if not scene_is_open(scene) and any(map(self._needs_scene, light.parts)):
+            light = resolve(light, opened())
         if rotate is None:
             return light
         if light.distant.is_empty:
@@ -104,6 +106,11 @@ class Asset:
         if emitters and not names:
             raise self._holds_none(self.own_lights)
         return [SceneLight(name) for name in names] or SceneLight()
+
+    def _needs_scene(self, part):
+        """Whether a part is a lamp of the scene whose light was not baked."""
+        baked = any(transport.takes(part) for transport in self.transports.values())
+        return part.own_name is not None and not baked
 
     def _holds(self, is_distant):
         """Whether distant, or local, light of the scene is in the asset: not where transport of
