@@ -108,9 +108,8 @@ class Asset:
         return [SceneLight(name) for name in names] or SceneLight()
 
     def _needs_scene(self, part):
-        """Whether a part is a lamp of the scene whose light was not baked."""
-        baked = any(transport.takes(part) for transport in self.transports.values())
-        return part.own_name is not None and not baked
+        """Whether a part is a lamp that is known by its name only, and whose light is not baked."""
+        return part.lacks_emitter and not any(t.takes(part) for t in self.transports.values())
 
     def _holds(self, is_distant):
         """Whether distant, or local, light of the scene is in the asset: not where transport of
