@@ -411,7 +411,7 @@ def test_same_seed_same_file(scene, tmp_path, capsys):
         ),
         (
             ("relight", "{asset}", "-o", "{folder}/x.png", "--renderer", "crayons"),
-            "mitsuba or raster",
+            "mitsuba, raster",
         ),
         (("compare", "{asset}", "-o", "{folder}/c", "--reference", "hearsay"), "modelled or full"),
         (("compare", "{asset}", "-o", "{asset}"), "cannot be written"),
@@ -525,7 +525,9 @@ def test_interrupting_leaves_only_what_can_be_continued(scene, tmp_path):
     process = subprocess.Popen(
         [*command, "--rays-per-direction", "64"], stderr=subprocess.PIPE, text=True
     )
-    time.sleep(4)
+    partial, end = tmp_path / "a.prt.partial", time.monotonic() + 60
+    while not (partial.exists() and any(partial.iterdir())) and time.monotonic() < end:
+        time.sleep(0.1)
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=60)
     assert process.returncode == 130

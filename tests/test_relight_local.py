@@ -10,7 +10,7 @@ import pytest
 from conftest import bias, diffuse, relative_l2
 
 import mi_prt
-from mi_prt import LightError, SettingsError
+from mi_prt import LightError, SceneError, SettingsError
 from mi_prt.cli import main
 from mi_prt.evaluate import ground_truth
 from mi_prt.lighting.to_mitsuba import lit_scene
@@ -168,7 +168,7 @@ def test_points_as_ply_and_npz(asset, tmp_path):
     found = np.load(tmp_path / "a.npz")
     np.testing.assert_array_equal(found["irradiance"], asset.irradiance(LIGHT))
     np.testing.assert_array_equal(found["radiance"], asset.relight(LIGHT))
-    relight_to_file(asset, tmp_path / "a.ply")
+    relight_to_file(asset, tmp_path / "a.ply", scene=room())
     assert (tmp_path / "a.ply").read_bytes().startswith(b"ply\n")
 
 
@@ -177,10 +177,12 @@ def test_own_light_is_the_default_and_can_be_one_of_several(asset, tmp_path):
     the same; more lights add up.
     """
     lamp = mi_prt.PointLight((0.2, 0.8, 0.3), (2.0, 2.0, 1.5))
-    own = asset.irradiance()
+    own = asset.irradiance(asset.resolved(scene=room()))
+    with pytest.raises(SceneError, match="--scene"):  # it came from memory, and no lamp is baked
+        asset.irradiance()
     np.testing.assert_allclose(asset.irradiance(lamp), own, rtol=1e-4, atol=1e-5)
     for name, light in (("a", None), ("b", "scene"), ("c", ["scene", LIGHT])):
-        relight_to_file(asset, tmp_path / f"{name}.npz", light)
+        relight_to_file(asset, tmp_path / f"{name}.npz", light, scene=room())
     found = {name: np.load(tmp_path / f"{name}.npz")["irradiance"] for name in "abc"}
     np.testing.assert_array_equal(found["a"], own)
     np.testing.assert_array_equal(found["b"], own)
@@ -302,9 +304,18 @@ def test_distant_assets_tell_no_components_apart_unless_asked(tmp_path):
         "floor": wall(0, 0, 0, [1, 0, 0], -90, diffuse(0.5)),
         "sky": {"type": "constant"},
     }
-    distant = mi_prt.precompute(flat, directions="cubemap:4", coefficients=1)
-    with pytest.raises(SettingsError, match="points='samples'"):
+    flat["wall"] = wall(0, 0.5, -1, [0, 1, 0], 0, diffuse(0.5))
+    settings = {"directions": "cubemap:4", "coefficients": 4, "edge_length": 0.5}
+    distant = mi_prt.precompute(flat, **settings)
+    with pytest.raises(SettingsError, match="keep_direct"):
         relight_to_file(distant, tmp_path / "a.npz", component="indirect", scene=flat)
+    apart = mi_prt.precompute(flat, keep_direct=True, **settings)
+    found = {}
+    for component in ("total", "direct", "indirect"):
+        relight_to_file(apart, tmp_path / "a.npz", component=component, scene=flat)
+        found[component] = np.load(tmp_path / "a.npz")["irradiance"]
+    assert relative_l2(found["direct"] + found["indirect"], found["total"]) < 1e-6
+    assert found["indirect"].any() and found["direct"].any()
     assert distant.irradiance(mi_prt.SpotLight((0, 1, 0), (0, -1, 0), 1.0)).any()
 
 

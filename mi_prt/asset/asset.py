@@ -67,8 +67,8 @@ class Asset:
         rotate : (axis, degrees), optional
             Turns the distant light.
         scene : Scene, path, dict or mi.Scene, optional
-            Needed where the light contains distant light of the scene, or lamps of which the asset
-            holds no transport of their own, and only then opened; by default where it was.
+            Needed where the light contains distant light of the scene, or lamps whose light is not
+            baked, and only then opened; by default where it was.
 
         Returns
         -------
@@ -88,8 +88,8 @@ class Asset:
         names = {emitter["name"]: emitter["distant"] for emitter in self.emitters}
         opened = scene if scene_is_open(scene) else lambda: open_scene_of(self, scene)
         light = resolve(light, opened, names)
-        if any(map(self._needs_place, light.parts)):
-            light = resolve(light, open_scene_of(self, scene), names)
+        if not scene_is_open(scene) and any(map(self._needs_scene, light.parts)):
+            light = resolve(light, opened())
         if rotate is None:
             return light
         if light.distant.is_empty:
@@ -99,17 +99,6 @@ class Asset:
             )
         return light.rotated(*rotate)
 
-    def _needs_place(self, part):
-        """Whether only transport answers for a part that must know where it shines, and the part
-        does not.
-        """
-        transports = self.transports.values()
-        return (
-            not part.is_placed
-            and not any(t.takes(part) for t in transports)
-            and any(t.stands_in_for(part) for t in transports)
-        )
-
     def _own_light(self):
         """The scene's own light, as far as the asset holds it."""
         emitters = self.emitters
@@ -117,6 +106,10 @@ class Asset:
         if emitters and not names:
             raise self._holds_none(self.own_lights)
         return [SceneLight(name) for name in names] or SceneLight()
+
+    def _needs_scene(self, part):
+        """Whether a part is a lamp that is known by its name only, and whose light is not baked."""
+        return part.lacks_emitter and not any(t.takes(part) for t in self.transports.values())
 
     def _holds(self, is_distant):
         """Whether distant, or local, light of the scene is in the asset: not where transport of

@@ -311,6 +311,9 @@ def main(arguments=None):
     except PrtError as error:
         print(f"mi-prt: {error}", file=sys.stderr)
         sys.exit(error.exit_code)
+    except KeyboardInterrupt:
+        note("interrupted")
+        sys.exit(130)
     except MemoryError:
         print(
             "mi-prt: out of memory: use fewer --directions or a longer --edge-length, or set"

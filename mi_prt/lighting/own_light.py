@@ -120,6 +120,11 @@ class Lamp(LocalPart):
         return self.name
 
     @property
+    def lacks_emitter(self):
+        """See `LightPart.lacks_emitter`."""
+        return self.own is None
+
+    @property
     def words(self):
         """See `LightPart.words`."""
         return f"the scene's lamp '{self.name}'"

@@ -36,8 +36,8 @@ class LightPart(ABC):
         Whether it stands for lights of the scene that `resolve` has not looked up yet.
     own_name : str or None
         Name of the scene's own lamp that it is.
-    is_placed : bool
-        Whether it knows where it shines; a lamp of a scene that is not open does not.
+    lacks_emitter : bool
+        Whether it is such a lamp of a scene that is not open, known by its name only.
     """
 
     kind: ClassVar[str]
@@ -48,7 +48,7 @@ class LightPart(ABC):
     is_shape: ClassVar[bool] = False
     of_scene: ClassVar[bool] = False
     own_name = None
-    is_placed = True
+    lacks_emitter = False
     __array_ufunc__ = None  # so that NumPy leaves `array * part` to the part
 
     @property

@@ -167,7 +167,8 @@ class IndirectTransport:
             {
                 "bounces": split.bounces,
                 "bounce_energy": [float(f"{x:.6g}") for x in split.energy],
-                "bounce_energy_left": split.left if np.isfinite(split.left) else None,
+                # between white walls there is no bound
+                **({"bounce_energy_left": split.left} if np.isfinite(split.left) else {}),
                 "channels": demand.channels,
                 "paths_per_point": demand.rays,
                 "indirect_noise": noise / max(total, 1e-300),

@@ -1,11 +1,12 @@
 """The Mitsuba integrator `prt`: any sensor and film, lit from an asset in one ray per sample."""
 
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 
 from ..asset.asset import load
-from ..errors import InputError, SettingsError
+from ..errors import SettingsError
 from ..scene.scene import Scene, SceneSource
 from ..scene.traversal import digest_of
 from ..system.runtime import VARIANTS, mitsuba
@@ -224,7 +225,5 @@ def integrator_for(asset, irradiance=None, direct="points"):
 def _load(filename):
     import mitsuba as mi
 
-    try:
-        return load(str(mi.file_resolver().resolve(filename)))  # pyright: ignore[reportCallIssue]
-    except InputError:
-        return load(filename)
+    found = Path(str(mi.file_resolver().resolve(filename)))  # pyright: ignore[reportCallIssue]
+    return load(found if found.exists() else filename)
