@@ -229,17 +229,6 @@ def test_buried_points_are_known_without_a_sky(room, points):
 # --- in the order of clusters ---------------------------------------------------------------------
 
 
-def test_points_in_one_place_are_no_clusters_of_their_own():
-    """Two plates in one place have 2n points at n places: of 1.5n clusters n come back, of two
-    points each. (Roots taken from all points at random would leave places without one.)
-    """
-    plate = rectangle(bsdf=diffuse())
-    points = sample_points(open_scene(scene(one=plate, other=dict(plate))), 0.3)
-    clusters = make_clusters(points, 3 * len(points) // 4)
-    clusters.check(len(points))
-    assert 2 * len(clusters) == len(points) and (np.diff(clusters.starts) == 2).all()
-
-
 def test_hemispheres_see_the_points_that_rays_meet(room, points):
     """A point seen, named by its place in the order of the clusters, is where the ray ends."""
     clusters = make_clusters(points, 40, 1)
