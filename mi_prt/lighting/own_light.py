@@ -130,11 +130,6 @@ class Lamp(LocalPart):
         return f"the scene's lamp '{self.name}'"
 
     @property
-    def is_placed(self):
-        """See `LightPart`."""
-        return self.own is not None
-
-    @property
     def is_shape(self):
         """Whether it is a shape that shines; False where the scene is not open."""
         return self.own is not None and self.own.shape is not None
