@@ -62,15 +62,16 @@ class OwnBuilder(Builder):
         """See `Builder.build`."""
         job, settings = self.job, self.job.settings
         found = job.workspace.keep("lamps", lambda: self._direct(job.points))
-        direct, noise = found[:-1], found[-1, :, 0]
+        direct, noise, found_rays = found[:-1], found[-1, :, 0], float(found[-1, 0, 1])
         job.clock.lap("lamps")
-        reflected, gathered = np.zeros_like(direct), {"bounces": 0}
+        reflected, gathered, rays = np.zeros_like(direct), {"bounces": 0}, 0
         if settings.lamp_bounces != 0:
             found = job.workspace.keep("lamp reflections", lambda: self._reflected(direct))
             reflected, gathered = found[:-1], _gathered(found[-1])
+            rays = settings.lamp_rays
         job.clock.lap("lamp reflections")
         report = {
-            "rays": len(job.points) * len(self._lights),
+            "rays": int(found_rays + len(job.points) * rays),
             "channels": 3,
             "direct_noise": float(noise.max(initial=0)),
             **gathered,
@@ -83,7 +84,7 @@ class OwnBuilder(Builder):
         return OwnTransport.from_arrays(exact.header(), exact.arrays(), job.points)
 
     def _direct(self, points):
-        """Direct irradiance (n, k, 3) of the lamps, and in one more row its noise."""
+        """Direct irradiance (n, k, 3) of the lamps, and in one more row its noise and rays."""
         job, settings = self.job, self.job.settings
         found = direct_light(
             job.scene,
@@ -94,8 +95,9 @@ class OwnBuilder(Builder):
             lanes=self._lanes,
             progress=lambda done, total: job.progress("lamps", done, total, ""),
         )
-        noise = found.noise(surface_shares(points, points.buried))
-        return np.concatenate([found.irradiance, _row(noise)])
+        row = _row(found.noise(surface_shares(points, points.buried)))
+        row[0, :, 1] = found.rays
+        return np.concatenate([found.irradiance, row])
 
     def _reflected(self, direct, rays=None):
         """Reflected irradiance (n, k, 3) of the lamps, and in one more row what is reported; by so
