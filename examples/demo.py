@@ -119,7 +119,7 @@ def turning_sky(asset, path, frames):
 def day_to_night(path):
     """Write pictures of a room under its sky and lamps, relit above, path-traced below."""
     begun = time.perf_counter()
-    asset = mi_prt.precompute(DAY_ROOM, coefficients=192, rays_per_direction=4)
+    asset = mi_prt.precompute(DAY_ROOM, count=15_000, paths_per_point=256)
     say(
         f"   {len(asset.points):,} {asset.settings['points']}, transports"
         f" {', '.join(asset.transports)}, {time.perf_counter() - begun:.0f} s"
