@@ -368,7 +368,7 @@ def test_same_seed_same_file(scene, tmp_path, capsys):
         (("relight", "{old}", "-o", "{folder}/x.png"), "older version of mi_prt"),
         (("relight", "{truncated}", "-o", "{folder}/x.png"), "truncated"),
         (("relight", "{foreign}", "-o", "{folder}/x.png"), "no mi_prt asset"),
-        (("relight", "{asset}", "-o", "{folder}/x.jpg"), ".exr, .png, .npz, .ply"),
+        (("relight", "{asset}", "-o", "{folder}/x.jpg"), ".exr, .npz, .ply, .png"),
         (("relight", "{folder}", "-o", "{folder}/x.png"), "is a folder"),
         (("compare", "{fifo}", "-o", "{folder}/c"), "is a fifo"),
         (("info", "{fifo}"), "is no regular file"),
@@ -387,7 +387,7 @@ def test_same_seed_same_file(scene, tmp_path, capsys):
         (("relight", "{asset}", "-o", "{folder}/x.npz", "--light", "scene*x"), "not of the form"),
         (("relight", "{asset}", "-o", "{folder}/x.npz", "--light", "sun:1"), "no known kind"),
         (("relight", "{asset}", "-o", "{folder}/x.npz", "--component", "direct"), "--keep-direct"),
-        (("relight", "{asset}", "-o", "{folder}/x.npz", "--nearest", "0"), "at least 1"),
+        (("relight", "{asset}", "-o", "{folder}/x.npz", "--nearest", "0"), "integer ≥ 1"),
         (("relight", "{asset}", "-o", "{folder}/x.png", "--spp", "0"), "spp must be 1…"),
         (("relight", "{asset}", "-o", "{folder}/x.png", "--frames", "3"), "--light-path"),
         (

@@ -343,7 +343,7 @@ def test_local_lights_are_listed_and_distant_ones_are_not():
         "ConstantBackgroundEmitter",
         "DirectionalEmitter",
     ]
-    asset = mi_prt.precompute(parts, directions="cubemap:4", edge_length=0.5)
+    asset = mi_prt.precompute(parts, transports="distant", directions="cubemap:4", edge_length=0.5)
     whats = " ".join(e["what"] for e in asset.scene["left_out"])
     assert (
         all(kind in whats for kind in ("AreaLight", "PointLight", "SpotLight"))

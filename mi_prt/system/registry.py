@@ -65,7 +65,7 @@ class Registry(Mapping):
         self._import()
         if not isinstance(name, str) or name not in self._kinds:
             shown = reprlib.repr(name)  # of a hostile file: any text
-            raise self._error(f"{self._what} {shown} is not known: use {', '.join(self._kinds)}")
+            raise self._error(f"{self._what} {shown} is not known: use {', '.join(self)}")
         return self._kinds[name]
 
     def __contains__(self, name):
@@ -74,7 +74,7 @@ class Registry(Mapping):
 
     def __iter__(self):
         self._import()
-        return iter(self._kinds)
+        return iter(sorted(self._kinds))
 
     def __len__(self):
         self._import()

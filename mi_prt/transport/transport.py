@@ -7,6 +7,8 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+import numpy as np
+
 from ..errors import SettingsError
 from ..system.registry import Registry
 from ..system.schema import Anything, Number, OneOf, Record, Text
@@ -64,9 +66,10 @@ class Question:
             raise SettingsError(
                 f"component '{self.component}' is not known: use {', '.join(COMPONENTS)}"
             )
-        if self.nearest < 1:
+        is_count = isinstance(self.nearest, int | np.integer) and not isinstance(self.nearest, bool)
+        if not is_count or self.nearest < 1:
             raise SettingsError(
-                f"the number of nearest directions must be at least 1, got {self.nearest}"
+                f"the number of nearest directions must be an integer ≥ 1, got {self.nearest!r}"
             )
 
 
