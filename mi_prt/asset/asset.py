@@ -86,10 +86,12 @@ class Asset:
         if light is None:
             light = self._own_light()
         names = {emitter["name"]: emitter["distant"] for emitter in self.emitters}
-        opened = scene if scene_is_open(scene) else lambda: open_scene_of(self, scene)
-        light = resolve(light, opened, names)
-        if not scene_is_open(scene) and any(map(self._needs_scene, light.parts)):
-            light = resolve(light, opened())
+        if scene_is_open(scene):
+            light = resolve(light, scene)
+        else:
+            light = resolve(light, lambda: open_scene_of(self, scene), names)
+            if any(map(self._needs_scene, light.parts)):
+                light = resolve(light, open_scene_of(self, scene))
         if rotate is None:
             return light
         if light.distant.is_empty:

@@ -4,7 +4,7 @@ import inspect
 import re
 from functools import wraps
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -135,7 +135,8 @@ def _parameter(option):
     """A keyword parameter for Typer; None where the user does not give it."""
     flag = "--" + option.name.replace("_", "-")
     default = "" if option.default in (None, False) else f" [{_shown(option.default)}]"
-    rest = {"help": _unmarked(option.help + default), "rich_help_panel": _PANELS[option.group]}
+    panel = _PANELS[option.group]
+    rest: dict[str, Any] = {"help": _unmarked(option.help + default), "rich_help_panel": panel}
     if isinstance(option, Flag):
         kind = typer.Option(f"{flag}/--no-{flag[2:]}", show_default=False, **rest)
         annotation = Annotated[bool | None, kind]
