@@ -35,6 +35,7 @@ HOURS = {  # its own light: what shines, and how bright it is
 }
 WALK = "1.6,1.7,1.6 -0.6,1.7,1.5 0.1,1.6,0.2 0.1,1.6,-1.4 -1.6,1.7,-1.8"  # through the doorway
 FRAME_SIZE = (400, 300)
+ROOM_SIZE = (320, 200)
 
 
 def main():
@@ -119,7 +120,7 @@ def turning_sky(asset, path, frames):
 def day_to_night(path):
     """Write pictures of a room under its sky and lamps, relit above, path-traced below."""
     begun = time.perf_counter()
-    asset = mi_prt.precompute(DAY_ROOM, count=15_000, paths_per_point=256)
+    asset = mi_prt.precompute(DAY_ROOM, count=15_000, paths_per_point=256, lamp_rays=1024)
     say(
         f"   {len(asset.points):,} {asset.settings['points']}, transports"
         f" {', '.join(asset.transports)}, {time.perf_counter() - begun:.0f} s"
@@ -130,11 +131,11 @@ def day_to_night(path):
         begun = time.perf_counter()
         irradiance = picture.irradiance()
         seconds = time.perf_counter() - begun
-        with picture.drawn(size=FRAME_SIZE, spp=32) as draw:
+        with picture.drawn(size=ROOM_SIZE, spp=32) as draw:
             images = [draw(irradiance)]
         lit = lit_scene(scene, picture.light, modelled=True)
-        with resized(lit.sensors()[0], FRAME_SIZE) as sensor:
-            images.append(ground_truth.image(lit, sensor, 128, 0, -1).mean)
+        with resized(lit.sensors()[0], ROOM_SIZE) as sensor:
+            images.append(ground_truth.image(lit, sensor, 64, 0, -1).mean)
         for row, image in zip(rows, images):
             row.append(display(image, picture.exposure()))
         say(f"   {hour}: relit in {1e3 * seconds:.0f} ms")
