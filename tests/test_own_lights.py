@@ -348,3 +348,10 @@ def test_objects_are_not_dimmed_behind_the_users_back():
     np.testing.assert_allclose(
         next(own.strength for own in opened.own_lights if own.name == "ball"), [3, 2, 1]
     )
+
+
+def test_dimmers_multiply():
+    """Half of a half is a quarter, whether the light has been looked up in a scene or not."""
+    for light in (SceneLight("lamp"), Lamp("lamp")):
+        twice = (light * 0.5) * (0.5, 1, 2)
+        np.testing.assert_allclose(twice.factor, [0.25, 0.5, 1.0])
