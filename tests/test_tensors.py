@@ -489,7 +489,8 @@ def test_places_that_are_refused(path, entries, held):
     """dtype, shape and place of each array fit together, and all arrays fill the file."""
     header, _ = parts(path)
     rewrite(path, {"__metadata__": header["__metadata__"]} | entries, bytes(held))
-    refused(path, "damaged", lambda path: read(path, {"a": Array("f4", ("n",))}))
+    schema = {"a": Array("f4", ("n",)), "b": Array(("f4", "u1"), ("m",), optional=True)}
+    refused(path, "damaged", lambda path: read(path, schema))
 
 
 def test_the_base_of_those_files_is_read(path):
