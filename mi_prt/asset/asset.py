@@ -12,6 +12,7 @@ from ..lighting.environment import LightWarning
 from ..lighting.light import Light
 from ..lighting.own_light import SceneLight, resolve
 from ..points.points import Points
+from ..transport.ledger import Entry
 from ..transport.transport import COMPONENTS, TRANSPORTS, Question
 from . import file
 from .provenance import open_scene_of, scene_is_open
@@ -303,7 +304,14 @@ class Asset:
 
     def ledger(self):
         """What is known of the asset's errors, a list of `Entry`."""
-        return [entry for t in self.transports.values() for entry in t.ledger()]
+        known = [entry for t in self.transports.values() for entry in t.ledger()]
+        coverage = self.points.report.get("coverage")
+        if isinstance(coverage, float):
+            what = "surface with no sample within a spacing, where light may be lost"
+            known.append(
+                Entry("points", what, 1 - coverage, "reachable surface", "measured", "count")
+            )
+        return known
 
     # --- file ---------------------------------------------------------------------------------
 

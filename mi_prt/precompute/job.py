@@ -7,9 +7,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from ..errors import SettingsError
+from ..system.memory import resident_bytes
 from ..system.registry import Registry
-from ..transport.bits import find_buried
+from ..transport.bits import LANES, find_buried
 
+LEAST_LANES = 1 << 16
 BUILDERS = Registry("transport", "mi_prt.precompute")
 
 
@@ -70,6 +73,34 @@ class Job:
             traced += len(block) * sampler.rays_per_point
             rate = traced / max(time.perf_counter() - started, 1e-9)
             self.progress(stage, rows.filled, rows.count, f"{rate / 1e6:.1f} million rays/s")
+
+
+def wavefront_lanes(limit, needed, lane_bytes, fewer):
+    """Lanes of a wavefront that fit into memory beside what must be held.
+
+    Parameters
+    ----------
+    limit : int
+        Bytes that the process may have resident.
+    needed : int
+        Bytes of what must be held beside the scene.
+    lane_bytes : int
+    fewer : str
+        What to use less of, for the error.
+
+    Raises
+    ------
+    SettingsError
+        If not even a small wavefront fits.
+    """
+    held = resident_bytes()
+    if limit - held < needed + lane_bytes * LEAST_LANES:
+        raise SettingsError(
+            f"memory {limit / 1e6:,.0f} MB is too little: the scene holds {held / 1e6:,.0f} MB"
+            f" and the run needs {needed / 1e6:,.0f} MB more; raise max_memory (--max-memory)"
+            f" or use fewer {fewer}"
+        )
+    return int(min(LANES, (limit - held - needed) // lane_bytes))
 
 
 class Builder(ABC):

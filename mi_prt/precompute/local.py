@@ -10,11 +10,9 @@ import numpy as np
 
 from ..basis.clustered import leading_components
 from ..directions.hemisphere import Hemisphere
-from ..errors import SettingsError
 from ..points.clusters import make_clusters
 from ..points.layout import Spacing
 from ..points.particles import example_places
-from ..system.memory import resident_bytes
 from ..transport.bits import LANES
 from ..transport.depth import DepthBuffers, compress
 from ..transport.hemispheres import NOTHING, HemisphereTracer, cluster_frames, gathered
@@ -22,14 +20,13 @@ from ..transport.local import LocalTransport
 from ..transport.transfer import all_reflections
 from ..transport.transfer_matrix import Transfer, within_budget
 from .examples import Examples, importance
-from .job import BUILDERS, Builder
+from .job import BUILDERS, Builder, wavefront_lanes
 from .local_checks import quantization_errors, visibility_errors
 from .reflections import GREY
 
 RECEIVERS = 64  # most components of the indirect irradiance of a cluster
 RESPONSES = 256  # examples that show which those are
 LANE_BYTES = 120  # of rays that are followed to points, for each of them
-LEAST_LANES = 1 << 16
 FIRST_POINTS, PROBE_POINTS = 200, 3000  # of the runs that the cost is predicted from
 EXPECTED_RANK = 60  # components of indirect irradiance that a cluster is expected to need
 
@@ -79,14 +76,9 @@ class LocalBuilder(Builder):
             + 8 * c * directions * (settings.depth_coefficients + 1)
             + 24 * columns * c * settings.transfer_coefficients
         )
-        held = resident_bytes()
-        if limit - held < needed + LANE_BYTES * LEAST_LANES:
-            raise SettingsError(
-                f"memory {limit / 1e6:,.0f} MB is too little: the scene holds {held / 1e6:,.0f} MB"
-                f" and the run needs {needed / 1e6:,.0f} MB more; raise max_memory (--max-memory)"
-                " or use fewer points, example lights or coefficients"
-            )
-        return int(min(LANES, (limit - held - needed) // LANE_BYTES))
+        return wavefront_lanes(
+            limit, int(needed), LANE_BYTES, "points, example lights or coefficients"
+        )
 
     # --- building -----------------------------------------------------------------------------
 

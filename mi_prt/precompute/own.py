@@ -4,17 +4,14 @@ import time
 
 import numpy as np
 
-from ..errors import SettingsError
-from ..system.memory import resident_bytes
 from ..transport.bits import LANES
 from ..transport.lamp_reflections import reflected_light
 from ..transport.lamps import direct_light
 from ..transport.own import OwnTransport
-from .job import BUILDERS, Builder
+from .job import BUILDERS, Builder, wavefront_lanes
 from .reflections import surface_shares
 
 LANE_BYTES = 400  # of rays that are followed to surfaces and from there to lamps
-LEAST_LANES = 1 << 16
 COLUMN_BYTES = 100  # of a point and lamp, while columns are put together
 PROBE_POINTS = 512, 4096  # points of two probes: their difference is free of what each call takes
 PROBE_RAYS = 16
@@ -47,14 +44,7 @@ class OwnBuilder(Builder):
         """Lanes of a wavefront that fit beside what must be held."""
         _ = self.job.scene.occluders
         needed = COLUMN_BYTES * len(self.job.points) * len(self._lights)
-        held = resident_bytes()
-        if limit - held < needed + LANE_BYTES * LEAST_LANES:
-            raise SettingsError(
-                f"memory {limit / 1e6:,.0f} MB is too little: the scene holds {held / 1e6:,.0f} MB"
-                f" and the run needs {needed / 1e6:,.0f} MB more; raise max_memory (--max-memory)"
-                " or use fewer points"
-            )
-        return int(min(LANES, (limit - held - needed) // LANE_BYTES))
+        return wavefront_lanes(limit, int(needed), LANE_BYTES, "points")
 
     # --- building -----------------------------------------------------------------------------
 
