@@ -1,5 +1,6 @@
 """Kinds of options: how a value is checked, whether it comes from Python or as text."""
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,7 +10,7 @@ from ..errors import SettingsError
 
 
 @dataclass(frozen=True)
-class Option:
+class Option(ABC):
     """One setting of a precomputation.
 
     Parameters
@@ -37,6 +38,7 @@ class Option:
         """The name in messages."""
         return self.name.replace("_", " ")
 
+    @abstractmethod
     def check(self, value):
         """A value of the option's own type.
 
@@ -45,7 +47,6 @@ class Option:
         SettingsError
             If it is out of range.
         """
-        raise NotImplementedError
 
     def _is_other(self, value, others):
         return any(value is o or (isinstance(value, str) and value == o) for o in others)
