@@ -7,6 +7,7 @@ from ..lighting.environment import LightWarning
 from ..lighting.to_mitsuba import lit_scene
 from ..transport.transport import Question
 from . import ground_truth, metrics
+from .views import compared_points
 
 MEASURED_POINTS = 4096
 MEASURED_SAMPLES = 64  # of each light, from each of them
@@ -32,8 +33,8 @@ def measure_error(asset, light, nearest, scene, seed=0):
     Returns
     -------
     dict
-        relative_rmse and bias (signed, relative) of the irradiance against Mitsuba's at `points`
-        points that are not buried, 4,096 at most.
+        relative_rmse and bias (signed, relative) of the irradiance against Mitsuba's, weighted by
+        area, at `points` points that are not buried, 4,096 at most.
 
     Raises
     ------
@@ -45,20 +46,21 @@ def measure_error(asset, light, nearest, scene, seed=0):
     LightWarning
         If a light is inside the hull.
     """
-    chosen = ground_truth.compared_points(asset, MEASURED_POINTS, seed)
+    points = asset.points
+    chosen, weights = compared_points(points.buried, points.areas, None, MEASURED_POINTS, seed)
+    weights = weights * points.areas[chosen]
     transport = asset.transports["distant"]
-    irradiance = transport.respond(asset.points, Question(light, nearest=nearest))
-    points = asset.points.at(chosen)
+    irradiance = transport.respond(points, Question(light, nearest=nearest))
     lit = lit_scene(scene, light, modelled=True)
     truth = ground_truth.irradiance(
-        lit, points, MEASURED_SAMPLES, MEASURED_PATHS, asset.reference_bounces, seed
+        lit, points.at(chosen), MEASURED_SAMPLES, MEASURED_PATHS, asset.reference_bounces, seed
     ).mean
     error = {
-        "relative_rmse": metrics.relative_rmse(irradiance[chosen], truth),
-        "bias": metrics.relative_bias(irradiance[chosen], truth),
+        "relative_rmse": metrics.relative_rmse(irradiance[chosen], truth, weights),
+        "bias": metrics.relative_bias(irradiance[chosen], truth, weights),
         "points": len(chosen),
     }
-    warning = transport.check(asset.points, light)
+    warning = transport.check(points, light)
     if warning:
         measured = (
             f"relative RMSE {error['relative_rmse']:.1%} and bias {error['bias']:+.1%} at"
