@@ -126,7 +126,7 @@ def test_irradiance_of_a_point_light_is_the_inverse_square_law():
 
 def test_the_truth_close_to_a_large_lamp():
     """A lamp 2 cm above a floor. A sample of its area alone may count 200 times the mean (noise
-    above 5 %); beside rays of directions each counts a few times at most. χ² of all points within 6
+    of 75 %); beside rays of directions each counts a few times at most. χ² of all points within 6
     standard deviations: false positives below 1e-8.
     """
     height, radiance = 0.02, 5.0

@@ -42,10 +42,10 @@ def point_irradiance(mi_scene, points, spp, seed=0):
     """Irradiance at points by Mitsuba's own sampling of its emitters and of directions, combined by
     the balance heuristic (Veach 1997, 9.2.4): no lattice, no basis, none of this program's rays.
 
-    Samples of emitters are stratified along the number that picks the emitter, so that each gets its
-    share of them. A few local and directional lights then have next to no noise. Where an emitter
-    has an extent, a quarter as many cosine-distributed rays are added, which alone do well beside a
-    large lamp: there a sample of its area may count without bound.
+    Samples of emitters are stratified along the number that picks the emitter, so that each gets
+    its share of them. A few local and directional lights then have next to no noise. Where an
+    emitter has an extent, a quarter as many cosine-distributed rays are added: beside a large lamp
+    a sample of its area may count without bound, a direction may not.
 
     Parameters
     ----------
