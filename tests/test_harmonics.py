@@ -412,7 +412,8 @@ def test_turns_of_light_add_up():
     What is not turned is as it was.
     """
     coefficients = np.random.default_rng(0).standard_normal((49, 3)).astype(np.float32)
-    environment = LatticeMap(Cubemap(1), np.ones((6, 3), np.float32), np.eye(3))
+    moments = np.zeros((6, 3, 3), np.float32)
+    environment = LatticeMap(Cubemap(1), np.ones((6, 3), np.float32), moments, np.eye(3))
     light = HarmonicMap(environment, ("cubemap:8", 49), coefficients)
     np.testing.assert_allclose(light.turned(), coefficients, atol=1e-6)
     turned = light.rotated("x", 20).rotated("y", 75)

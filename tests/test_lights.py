@@ -86,8 +86,8 @@ def unoccluded(points, lights):
 
 def seen(light, positions, directions, nearest=1):
     """Cells and irradiance of a light of one place."""
-    (arriving,) = arrival(light.emission(), positions, directions, nearest)
-    return arriving
+    ((cells, _, irradiance),) = arrival(light.emission(), positions, directions, nearest)
+    return cells, irradiance
 
 
 def precompute(content, directions="cubemap:16", **settings):
@@ -115,7 +115,7 @@ def room():
 # --- closed forms ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("nearest", [1, 4])
+@pytest.mark.parametrize("nearest", [1, 4, None])
 @pytest.mark.parametrize(
     "content", [scene(floor=rectangle(size=2)), scene(ball=sphere((0, 0.5, 0), 0.7))]
 )
@@ -136,6 +136,17 @@ def test_irradiance_is_that_of_the_inverse_square_law(content, nearest):
         )
         assert (np.abs(result - expected) <= arriving * off + 1e-6).all()
         assert abs(bias(result, expected)) < 0.5 / resolution
+
+
+def test_the_three_directions_around_have_the_cosine_of_the_light():
+    """Where nothing is in between, their error is of second order in the cell's side (but at the
+    horizon of a point): a seventh of that of the nearest direction, on cubemap:32 below 0.3 %.
+    """
+    light = PointLight([1.0, 2.5, -0.7], [3.0, 1.0, 0.2])
+    asset = precompute(scene(ball=sphere((0, 0.5, 0), 0.7)), "cubemap:32")
+    expected = unoccluded(asset.points, [light])
+    around, one = (relative_l2(asset.irradiance(light, nearest=n), expected) for n in (None, 1))
+    assert around < one / 5 and around < 0.003
 
 
 @pytest.mark.parametrize("nearest", [1, 4])
@@ -210,7 +221,7 @@ def test_extreme_places_give_finite_light(floor):
     assert (floor.irradiance(grazing) <= arriving * np.pi / 4 / 16 * (8 / 3) ** 0.5).all()
 
 
-@pytest.mark.parametrize("nearest", [0, -1, 1.5, True, None, 10**6])
+@pytest.mark.parametrize("nearest", [0, -1, 1.5, True, 10**6])
 def test_a_number_of_directions_that_the_lattice_does_not_have(floor, nearest):
     with pytest.raises(SettingsError):
         floor.irradiance(PointLight([0, 1, 0], 1), nearest=nearest)
@@ -289,7 +300,7 @@ def test_compression_keeps_local_lights(box):
     compressed = precompute(
         box_on_floor(), basis="pca", rays_per_direction=4, coefficients=96, bounces=0
     )
-    result = compressed.irradiance(light)
+    result = compressed.irradiance(light, nearest=1)
     cells, arriving = seen(light, box.points.positions, distant(box).directions)
     rows = distant(compressed).total.rows(np.arange(len(box.points)))
     np.testing.assert_allclose(
@@ -663,10 +674,7 @@ def test_a_sun_keeps_its_energy_when_maps_are_summed():
     """
 
     def energy(environment):  # of Mitsuba's interpolation, exactly: see test_directions_lighting
-        return sum(
-            (w[:, None] * radiance).sum(dtype=np.float64)
-            for _, w, radiance in environment.quadrature(0.1)
-        )
+        return environment.quadrature(0.1).energy.sum(dtype=np.float64)
 
     rng = np.random.default_rng(2)
     ratios = []

@@ -216,7 +216,7 @@ class Asset:
 
     # --- relighting ---------------------------------------------------------------------------
 
-    def irradiance(self, light=None, component="total", nearest=1):
+    def irradiance(self, light=None, component="total", nearest=None):
         """Irradiance at the points.
 
         Parameters
@@ -225,9 +225,10 @@ class Asset:
             Any number of environment maps, directional and local lights and lights of the scene;
             their irradiances add up. By default the scene's own light.
         component : 'total', 'direct' or 'indirect'
-        nearest : int
+        nearest : int, optional
             Directions that stand for a local light where transport is for distant light only
-            (Eigentransport, section 4.2.1).
+            (Eigentransport, section 4.2.1); by default the three around its own, in shares that
+            keep its direction.
 
         Returns
         -------
@@ -257,7 +258,7 @@ class Asset:
         found = (self.transports[kind].check(self.points, light) for kind, light in shares.items())
         return [warning for warning in found if warning]
 
-    def answered(self, shares, component="total", nearest=1):
+    def answered(self, shares, component="total", nearest=None):
         """Irradiance (n, 3) float32 under light shared out, without warnings; see `irradiance`."""
         Question(Light(()), component, nearest)
         total = np.zeros((len(self.points), 3), np.float32)
@@ -266,7 +267,7 @@ class Asset:
             total += self.transports[kind].respond(self.points, question)
         return total
 
-    def relight(self, light=None, component="total", nearest=1):
+    def relight(self, light=None, component="total", nearest=None):
         """Outgoing radiance B = ρ/π · E at the points, (n, 3) float32 in W/(m²·sr); see
         `irradiance`.
         """

@@ -49,12 +49,15 @@ class Compressed:
         irradiance += mean_response
         return irradiance
 
-    def in_cells(self, cells):
-        """Transport (n, 1) or (n, 3) float32, the mean over some cells (n, k) of each point."""
+    def in_cells(self, cells, shares):
+        """Transport (n, 1) or (n, 3) float32, the sum over some cells (n, k) of each point times
+        their shares (n, k).
+        """
 
         def transport(first):
             block = slice(first, first + BLOCK_ROWS)
-            return self.basis.at(self.coefficients[block], cells[block]).mean(axis=1)
+            found = self.basis.at(self.coefficients[block], cells[block])
+            return np.einsum("nk...,nk->n...", found, shares[block])
 
         seen = np.concatenate(list(map_chunks(transport, range(0, len(self), BLOCK_ROWS))))
         return seen if seen.ndim == 2 else seen[:, None]

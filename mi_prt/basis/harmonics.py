@@ -290,6 +290,10 @@ class HarmonicMap(DistantPart):
         """See `LatticeMap`."""
         return self.environment.at(vectors)
 
+    def quadrature(self, spacing):
+        """See `LatticeMap`."""
+        return self.environment.quadrature(spacing)
+
 
 def fit_harmonics(
     rows: Rows, target: Target, seed=0, progress=lambda done, total: None, max_bytes=inf

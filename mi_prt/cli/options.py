@@ -65,11 +65,12 @@ Direct = Annotated[
     ),
 ]
 Nearest = Annotated[
-    int,
+    int | None,
     typer.Option(
         "--nearest",
         metavar="K",
-        help="Directions that stand for a lamp where only distant transport is there.",
+        help="Directions in equal shares that stand for a lamp where only distant transport is"
+        " there; by default the three around it, weighted to keep its direction.",
     ),
 ]
 Rotate = Annotated[

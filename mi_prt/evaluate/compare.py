@@ -43,7 +43,7 @@ def compare(
     reference="modelled",
     seed=0,
     progress=lambda stage, done, total: None,
-    nearest=1,
+    nearest=None,
     direct="points",
 ):
     """Compare an asset with Mitsuba and write the comparison to a folder.
@@ -69,7 +69,7 @@ def compare(
         asked for dark) or as written.
     seed : int
     progress : callable(stage, done, total)
-    nearest : int
+    nearest : int, optional
         Directions that stand for a local light, see `Asset.irradiance`.
     direct : 'points' or 'pixels'
         Where direct light of local lights is computed for the image.

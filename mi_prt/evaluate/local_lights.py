@@ -23,7 +23,7 @@ def measure_error(asset, light, nearest, scene, seed=0):
     asset : Asset
     light : Light
         Resolved, of local parts.
-    nearest : int
+    nearest : int, optional
         Directions that stand for a light.
     scene : Scene
         That of the asset.
@@ -79,7 +79,7 @@ def stand_in_error(asset, light, nearest, open_scene, seed=0):
     asset : Asset
     light : Light
         Resolved.
-    nearest : int
+    nearest : int, optional
     open_scene : callable() returning Scene or None
         None where it is not worth to open it.
     seed : int

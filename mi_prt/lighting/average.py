@@ -1,6 +1,14 @@
-"""Radiance averaged over the cells of a direction lattice, with its energy."""
+"""Light put on a direction lattice with its energy and its first moment."""
+
+from functools import lru_cache
 
 import numpy as np
+import scipy.sparse
+
+from ..directions.triangles import triangles_of
+
+_KEPT = 4  # sets of directions whose cells are kept
+_ASTRAY = 2.0  # a centroid this many cell sides away from its cell is one of rounding
 
 
 def sample_spacing(directions, samples_per_side):
@@ -8,41 +16,129 @@ def sample_spacing(directions, samples_per_side):
     return np.sqrt(4 * np.pi / len(directions)) / samples_per_side
 
 
-def average(environment, spacing, directions):
-    """Mean radiance of each cell from samples that cover the sphere.
+def put(directions, vectors, energy):
+    """Light from single directions, spread over those of the lattice around each.
 
-    Samples are given whole to the cell that holds their direction. The solid angle a cell receives
-    then differs a little from its own; the difference is traded with its neighbours at the radiance
-    of the cell's dimmest sample, which keeps a sun whole and a constant constant, and what
-    imbalance that leaves (of the order of 1e-4) is scaled away. A cell so thin that no sample falls
-    into it (at the pole of a long latitude-longitude lattice) has the radiance at its direction.
+    Energy is kept, and so is the direction of the first moment Σ E ω: irradiance on a surface that
+    sees all of it is that of the light, not of the middle of its cell. See `Triangles` for the
+    moment's length.
 
     Parameters
     ----------
-    environment : EnvironmentMap or LatticeMap
-        What has `quadrature(spacing)` and `at(vectors)`.
-    spacing : float
-        Of the samples, in radians.
     directions : direction lattice
+    vectors : (k, 3)
+        Of any positive length.
+    energy : (k, c)
+        W/m².
+
+    Returns
+    -------
+    (s, c) float64
+        Energy of the cells.
+    """
+    cells, shares = triangles_of(directions).around(vectors)
+    rows = np.repeat(np.arange(len(cells)), 3)
+    spread = scipy.sparse.csr_matrix(
+        (shares.ravel(), (cells.ravel(), rows)), (len(directions), len(cells))
+    )
+    return spread @ energy
+
+
+def average(quadrature, directions, at):
+    """Mean radiance of each cell from samples that cover the sphere.
+
+    Each sample is first given whole to the cell that holds its direction. The solid angle a cell
+    receives then differs a little from its own; the difference is traded with its neighbours at the
+    radiance of the cell's dimmest sample, which keeps a sun whole and a constant constant, and what
+    imbalance that leaves (of the order of 1e-4) is scaled away. What a cell holds beyond its
+    dimmest sample then moves from the cell's middle to its own centroid, see `put`.
+
+    Parameters
+    ----------
+    quadrature : Quadrature
+    directions : direction lattice
+    at : callable((k, 3) vectors) returning (k, 3)
+        Radiance at directions, for cells so thin that no sample falls into them (at the pole of a
+        long latitude-longitude lattice).
 
     Returns
     -------
     (s, 3) float64
     """
-    count = len(directions)
-    energy = np.zeros((count, 3))
-    covered = np.zeros(count)
-    dimmest = np.full((count, 3), np.inf, dtype=np.float32)
-    for vectors, solid_angles, radiance in environment.quadrature(spacing):
-        cells = directions.cells(vectors)
-        covered += np.bincount(cells, solid_angles, count)
-        for channel in range(3):
-            energy[:, channel] += np.bincount(cells, solid_angles * radiance[:, channel], count)
-            np.minimum.at(dimmest[:, channel], cells, radiance[:, channel])
     w = directions.solid_angles[:, None]
-    missed = covered == 0
-    if missed.any():
-        dimmest[missed] = environment.at(directions.vectors[missed])
-    corrected = np.maximum(energy - dimmest * (covered[:, None] - w), 0)
-    total = corrected.sum(axis=0)
-    return corrected / w * np.divide(energy.sum(axis=0), total, out=np.zeros(3), where=total > 0)
+    base, beyond, moments = split(quadrature, directions, at)
+    for channel in range(3):
+        moved = np.flatnonzero(beyond[:, channel] > 0)
+        toward = moments[moved, channel]
+        astray = _is_astray(toward, directions.vectors[moved], len(directions))
+        toward[astray] = directions.vectors[moved[astray]]
+        excess = beyond[moved, channel]
+        base[:, channel] += put(directions, toward, excess[:, None])[:, 0] if len(moved) else 0
+    return base / w
+
+
+def split(quadrature, directions, at):
+    """What cells hold, see `average`: energy of their dimmest sample everywhere (s, 3), energy
+    beyond it (s, 3), and its first moment (s, 3, 3), channels first.
+    """
+    w = directions.solid_angles[:, None]
+    groups, order, starts, filled = _groups(quadrature, directions)
+    solid_angles = quadrature.solid_angles.astype(np.float64)
+    covered = groups @ solid_angles[:, None]
+    reach = groups @ (solid_angles[:, None] * quadrature.vectors)
+    energy = groups @ quadrature.energy.astype(np.float64)
+    moments = (groups @ quadrature.moments.reshape(-1, 9).astype(np.float64)).reshape(-1, 3, 3)
+    dimmest = np.empty((len(directions), 3))
+    dimmest[filled] = np.minimum.reduceat(quadrature.radiance[order], starts, axis=0)
+    if not filled.all():
+        dimmest[~filled] = at(directions.vectors[~filled])
+    beyond = np.maximum(energy - dimmest * covered, 0)
+    moments -= dimmest[:, :, None] * reach[:, None]
+    total = (dimmest * w + beyond).sum(axis=0)
+    whole = np.divide(energy.sum(axis=0), total, out=np.zeros(3), where=total > 0)
+    return dimmest * w * whole, beyond * whole, moments
+
+
+def _is_astray(toward, middles, count):
+    length = np.linalg.norm(toward, axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        cosine = np.sum(toward * middles, axis=1) / length
+    return ~(cosine > np.cos(min(_ASTRAY * np.sqrt(4 * np.pi / count), np.pi / 2)))
+
+
+def _groups(quadrature, directions):
+    """Samples by cells: the matrix (s, k) that sums them; their order, where the cells start in it,
+    and which cells (s,) have any.
+    """
+    if quadrature.place is None:
+        return _grouped(quadrature.vectors, directions)
+    return _grouped_once(_Placed(quadrature), directions)
+
+
+class _Placed:
+    """A quadrature's vectors, equal where its place is."""
+
+    def __init__(self, quadrature):
+        self.vectors, self._place = quadrature.vectors, quadrature.place
+
+    def __eq__(self, other):
+        return self._place == other._place
+
+    def __hash__(self):
+        return hash(self._place)
+
+
+@lru_cache(_KEPT)
+def _grouped_once(placed, directions):
+    return _grouped(placed.vectors, directions)
+
+
+def _grouped(vectors, directions):
+    cells = directions.cells(vectors)
+    order = np.argsort(cells, kind="stable")
+    numbers = np.bincount(cells, minlength=len(directions))
+    ends = np.concatenate([[0], np.cumsum(numbers)])
+    ones = np.ones(len(cells), np.float32)
+    groups = scipy.sparse.csr_matrix((ones, order, ends), (len(directions), len(cells)))
+    filled = numbers > 0
+    return groups, order, ends[:-1][filled], filled

@@ -10,7 +10,7 @@ import numpy as np
 from ..errors import LightError
 from .light import as_light
 
-SAMPLES_PER_CELL_SIDE = 16  # cell edges then cut the map to 1/16 of a cell
+SAMPLES_PER_CELL_SIDE = 8  # cell edges then cut the map to 1/8 of a cell
 
 
 def cell_radiance(light, directions, samples_per_side=SAMPLES_PER_CELL_SIDE):

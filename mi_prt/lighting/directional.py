@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from .average import put
 from .part import LIGHTS, DistantPart
 from .rotation import rotation_matrix
 from .values import direction, fields_from_text, rgb, rgb_factor, rgb_spectrum
@@ -43,11 +44,9 @@ class DirectionalLight(DistantPart):
         return cls(*fields_from_text(text, vectors=1))
 
     def radiance(self, directions, samples_per_side):
-        """All of its irradiance in the one cell that it comes from; see `DistantPart.radiance`."""
-        found = np.zeros((len(directions), 3))
-        cell = directions.cells(-self.direction[None])[0]
-        found[cell] = self.irradiance / directions.solid_angles[cell]
-        return found
+        """Its irradiance in the cells around its direction, see `put`."""
+        found = put(directions, -self.direction[None], self.irradiance[None])
+        return found / directions.solid_angles[:, None]
 
     def rotated(self, axis, degrees):
         """See `LightPart.rotated`."""

@@ -14,6 +14,7 @@ from ..system.runtime import mitsuba
 from .average import average, sample_spacing
 from .map_file import read_pixels
 from .part import LIGHTS, DistantPart
+from .quadrature import of_map
 from .rotation import orthonormal, parse_rotation, rotation_matrix
 from .values import rgb_factor
 
@@ -125,7 +126,8 @@ class EnvironmentMap(DistantPart):
 
     def radiance(self, directions, samples_per_side):
         """See `DistantPart.radiance`."""
-        return average(self, sample_spacing(directions, samples_per_side), directions)
+        spacing = sample_spacing(directions, samples_per_side)
+        return average(self.quadrature(spacing), directions, self.at)
 
     @property
     def size(self):
@@ -149,64 +151,9 @@ class EnvironmentMap(DistantPart):
         lower = self.pixels[below, left] * (1 - weight_u) + self.pixels[below, right] * weight_u
         return upper * (1 - weight_v) + lower * weight_v
 
-    def quadrature(self, spacing, band=1 << 20):
-        """Samples that integrate the map over the sphere, in bands of rows so that memory stays
-        bounded.
-
-        Every pixel is split until its samples are no farther apart than `spacing`; radiance between
-        the pixel centres is bilinear, as Mitsuba evaluates it.
-
-        Parameters
-        ----------
-        spacing : float
-            Largest distance of neighbouring samples, in radians.
-        band : int
-            About the number of samples in a band.
-
-        Yields
-        ------
-        vectors : (k, 3) float32
-            Unit vectors in world space.
-        solid_angles : (k,) float32
-            In sr; all bands together sum to 4π.
-        radiance : (k, 3) float32
-        """
-        # Pixels are nodes of a bilinear function. The intervals between them are split, so that no
-        # sample spans a kink and every sample's mean radiance is exact: at the middle in u, at the
-        # mean of v over the sphere in v.
-        height, width, _ = self.pixels.shape
-        intervals = max(height - 1, 1)
-        splits_v = max(1, int(np.ceil(np.pi / intervals / spacing)))
-        splits_u = max(1, int(np.ceil(2 * np.pi / width / spacing)))
-        rows, columns = intervals * splits_v, width * splits_u
-        phi = ((np.arange(columns) + 0.5) / splits_u + 0.5) * (2 * np.pi / width)
-        around = np.stack([np.sin(phi), np.zeros(columns), -np.cos(phi)], axis=-1)
-        left = np.arange(columns) // splits_u
-        right = (left + 1) % width
-        weight_u = ((np.arange(columns) % splits_u + 0.5) / splits_u).astype(np.float32)[:, None]
-        step = max(1, band // columns)
-        for first in range(0, rows, step):
-            row = np.arange(first, min(first + step, rows))
-            first_theta, last_theta = row * (np.pi / rows), (row + 1) * (np.pi / rows)
-            # Exact solid angle of a latitude band, and the mean of θ over it: ∫ θ sin θ = sin θ − θ
-            # cos θ.
-            ring = np.cos(first_theta) - np.cos(last_theta)
-            mean_theta = (_theta_moment(last_theta) - _theta_moment(first_theta)) / ring
-            above = row // splits_v
-            below = np.minimum(above + 1, height - 1)
-            weight_v = (mean_theta * (intervals / np.pi) - above).astype(np.float32)[:, None, None]
-            lines = self.pixels[above] * (1 - weight_v) + self.pixels[below] * weight_v
-            radiance = lines[:, left] * (1 - weight_u) + lines[:, right] * weight_u
-            vectors = np.sin(mean_theta)[:, None, None] * around + np.cos(mean_theta)[
-                :, None, None
-            ] * np.array([0.0, 1.0, 0.0])
-            vectors = (vectors.reshape(-1, 3) @ self.rotation.T).astype(np.float32)
-            solid_angles = np.repeat(ring * (2 * np.pi / columns), columns).astype(np.float32)
-            yield vectors, solid_angles, radiance.reshape(-1, 3).astype(np.float32)
-
-
-def _theta_moment(theta):
-    return np.sin(theta) - theta * np.cos(theta)
+    def quadrature(self, spacing):
+        """The map in samples no farther apart than `spacing` radians, a Quadrature."""
+        return of_map(self.pixels, self.rotation, spacing)
 
 
 def _validated(pixels, scale):

@@ -3,8 +3,8 @@
 Eigentransport (section 5) rotates light by bilinear interpolation on the sampling lattice itself.
 That loses energy and blurs a small source anew at each turn. Here the light is averaged once over a
 lattice a few times finer than the asset's; a rotation turns the fine cells and averages them over
-the coarse ones with the same energy-exact rule as pixels (`cells.average`). The cost does not
-depend on the map's resolution.
+the coarse ones by the same rule as pixels (`average`), which keeps energy and first moment. The
+cost does not depend on the map's resolution.
 """
 
 from dataclasses import dataclass, replace
@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 
 from ..system.parallel import one_blas_thread
-from .average import average, sample_spacing
-from .cells import cell_radiance
+from .average import average, sample_spacing, split
 from .light import Light, as_light
 from .part import DistantPart
+from .quadrature import Quadrature
 from .rotation import rotation_matrix
 from .summed import summed_maps
 from .values import rgb_factor
@@ -27,18 +27,21 @@ SAMPLES_PER_FINE_SIDE = 4
 
 @dataclass(frozen=True, eq=False)
 class LatticeMap(DistantPart):
-    """An environment as mean radiance over the cells of a lattice, with a rotation.
+    """An environment as light in the cells of a lattice, with a rotation.
 
     Parameters
     ----------
     directions : direction lattice
     cell_means : (s, 3) float32
         Radiance of the cells.
+    moments : (s, 3, 3) float32
+        ∫ L ω dω of the cells: channels, then x, y, z.
     rotation : (3, 3) float64
     """
 
     directions: Any
     cell_means: np.ndarray
+    moments: np.ndarray
     rotation: np.ndarray
 
     kind = "environment on a lattice"
@@ -53,7 +56,9 @@ class LatticeMap(DistantPart):
 
     def scaled(self, factor):
         """See `LightPart.scaled`."""
-        return replace(self, cell_means=self.cell_means * rgb_factor(factor).astype(np.float32))
+        factors = rgb_factor(factor).astype(np.float32)
+        means, moments = self.cell_means * factors, self.moments * factors[:, None]
+        return replace(self, cell_means=means, moments=moments)
 
     def to_mitsuba(self):
         """An environment map that shows the cells; see `LightPart.to_mitsuba`."""
@@ -61,7 +66,8 @@ class LatticeMap(DistantPart):
 
     def radiance(self, directions, samples_per_side):
         """See `DistantPart.radiance`."""
-        return average(self, sample_spacing(directions, samples_per_side), directions)
+        spacing = sample_spacing(directions, samples_per_side)
+        return average(self.quadrature(spacing), directions, self.at)
 
     @property
     def size(self):
@@ -78,12 +84,13 @@ class LatticeMap(DistantPart):
         return self.cell_means[self.directions.cells(vectors @ self.rotation)]
 
     def quadrature(self, spacing):
-        """The cells as samples that cover the sphere, in one band; see
-        `EnvironmentMap.quadrature`.
-        """
+        """The cells as samples, see `EnvironmentMap.quadrature`."""
+        solid_angles = self.directions.solid_angles.astype(np.float32)
+        turn = self.rotation.T.astype(np.float32)
         with one_blas_thread():
-            vectors = self.directions.vectors @ self.rotation.T.astype(np.float32)
-        yield vectors, self.directions.solid_angles.astype(np.float32), self.cell_means
+            vectors, moments = self.directions.vectors @ turn, self.moments @ turn
+        energy = self.cell_means * solid_angles[:, None]
+        return Quadrature(vectors, solid_angles, energy, moments)
 
 
 def on_lattice(light, directions, refinement=REFINEMENT):
@@ -107,6 +114,12 @@ def on_lattice(light, directions, refinement=REFINEMENT):
     if not maps:
         return light
     fine = directions.refined(refinement)
-    radiance = cell_radiance(Light(maps), fine, SAMPLES_PER_FINE_SIDE)
+    spacing = sample_spacing(fine, SAMPLES_PER_FINE_SIDE)
+    energy, moments = np.zeros((len(fine), 3)), np.zeros((len(fine), 3, 3))
+    for part in maps:
+        base, beyond, offset = split(part.quadrature(spacing), fine, part.at)
+        energy += base + beyond
+        moments += base[:, :, None] * fine.vectors[:, None] + offset
+    means = (energy / fine.solid_angles[:, None]).astype(np.float32)
     others = tuple(part for part in light.parts if not part.is_environment)
-    return Light((LatticeMap(fine, radiance, np.eye(3)), *others))
+    return Light((LatticeMap(fine, means, moments.astype(np.float32), np.eye(3)), *others))

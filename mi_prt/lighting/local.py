@@ -5,20 +5,24 @@ Eigentransport, section 4.2.1: as seen from a point x, a local light at p is lig
 lattice's direction nearest to p − x. The paper leaves its strength to a constant. Physically it is
 irradiance I/r² on a surface that faces the light, at the distance r = |p − x|, so that cell j has
 the radiance I/(r² w_j) and the irradiance of a surface is E = I/r² · T_j with T_j the transport of
-x from that cell. Transport knows what lies between x and infinity, not what lies between x and p:
-that is the same only where the light is outside the convex hull of the scene.
+x from that cell. One cell has the cosine of its own direction; three around p − x together
+have that of the light. Transport knows what lies between x and infinity, not what lies between x
+and p: that is the same only where the light is outside the convex hull of the scene.
 """
 
 import numpy as np
 
+from ..directions.triangles import triangles_of
+
 NAMED_PLACES = 3  # places that a warning names
 
 
-def arrival(emission, positions, directions, nearest=1):
+def arrival(emission, positions, directions, nearest=None):
     """Where each place of local light is seen from, and how strongly it shines there.
 
-    The irradiance of point i is E_i = Σ irradiance_i · mean over its cells j of T_ij, a sum over
-    the places (Eigentransport eq. 4 with the cells' radiance I f(ω)/(k r² w_j)).
+    The irradiance of point i is E_i = Σ irradiance_i Σ_j share_ij T_ij, a sum over the places and
+    the directions j that stand for each (Eigentransport eq. 4 with the cells' radiance
+    I f(ω) share/(r² w_j)).
 
     Parameters
     ----------
@@ -26,13 +30,17 @@ def arrival(emission, positions, directions, nearest=1):
     positions : (n, 3)
         World space, m.
     directions : direction lattice
-    nearest : int
-        Number k of directions that stand for a place, those nearest to its own.
+    nearest : int, optional
+        Number k of directions that stand for a place, those nearest to its own, in equal shares
+        (section 4.2.1). By default the three around it, in shares that keep its direction: see
+        `Triangles`.
 
     Yields
     ------
     cells : (n, k) int64
         Indices of directions.
+    shares : (n, k) float32
+        Rows sum to 1.
     irradiance : (n, 3) float32
         I f(ω)/r² in W/m², on a surface that faces the place; at most the largest float32. Zero at a
         point in which the place lies: it has no direction there.
@@ -54,8 +62,13 @@ def arrival(emission, positions, directions, nearest=1):
         with np.errstate(over="ignore"):
             irradiance = intensity * share / distance / distance
         irradiance[here] = 0
-        cells = directions.nearest(toward, nearest)
-        yield cells, np.minimum(irradiance, np.finfo(np.float32).max).astype(np.float32)
+        irradiance = np.minimum(irradiance, np.finfo(np.float32).max).astype(np.float32)
+        if nearest is None:
+            cells, shares = triangles_of(directions).around(toward)
+        else:
+            cells = directions.nearest(toward, nearest)
+            shares = np.full(cells.shape, 1 / nearest)
+        yield cells, shares.astype(np.float32), irradiance
 
 
 def hull_warning(positions, hull):

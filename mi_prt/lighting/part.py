@@ -26,8 +26,8 @@ class LightPart(ABC):
         Whether its light comes from infinity.
     is_environment : bool
         Whether Mitsuba shows it as an environment, of which a scene takes only one. It then has
-        `size` (rows, columns), `rotation` (3, 3), `at(vectors)` (k, 3) and `pixels`, (h, w, 3) or
-        None, as `EnvironmentMap` has them, so that several are summed.
+        `size` (rows, columns), `rotation` (3, 3), `at(vectors)` (k, 3), `quadrature(spacing)` and
+        `pixels`, (h, w, 3) or None, as `EnvironmentMap` has them, so that several are summed.
     is_movable : bool
         Whether `moved` takes it elsewhere.
     is_shape : bool

@@ -20,7 +20,7 @@ def relight_to_file(
     size=None,
     renderer="mitsuba",
     spp=64,
-    nearest=1,
+    nearest=None,
     component="total",
     direct="points",
 ):
@@ -43,7 +43,7 @@ def relight_to_file(
         The integrator `prt`, or pyrender: triangles between vertices, splats of samples.
     spp : int
         Samples per pixel of the integrator.
-    nearest : int
+    nearest : int, optional
         Directions that stand for a local light where only transport of distant light is there, see
         `Asset.irradiance`.
     component : 'total', 'direct' or 'indirect'

@@ -25,11 +25,11 @@ class Picture:
     component : 'total', 'direct' or 'indirect'
     direct : 'points' or 'pixels'
         Whether direct light of local lights is computed at the points or at each pixel.
-    nearest : int
+    nearest : int, optional
         See `Asset.irradiance`.
     """
 
-    def __init__(self, asset, scene, light, component="total", direct="points", nearest=1):
+    def __init__(self, asset, scene, light, component="total", direct="points", nearest=None):
         self.asset, self._opened = asset, scene
         self._component, self._nearest = component, nearest
         self._at_pixels = check_direct(direct) == "pixels" and component != "indirect"

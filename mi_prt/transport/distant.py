@@ -49,7 +49,7 @@ class DistantTransport(Transport):
         return part.is_distant
 
     def stands_in_for(self, part):
-        """Local light, seen in the directions nearest to its own (section 4.2.1)."""
+        """Local light, seen in the directions around its own (section 4.2.1)."""
         return not part.is_distant
 
     def check(self, points, light):
@@ -88,10 +88,10 @@ class DistantTransport(Transport):
         """Irradiance (n, 3); what compression leaves below zero of the sum is zero."""
         light = question.light
         irradiance = transport.respond(*transport.basis.project(light.distant, self.directions))
-        for cells, strength in arrival(
+        for cells, shares, strength in arrival(
             emission_of(light.local), points.positions, self.directions, question.nearest
         ):
-            irradiance += strength * transport.in_cells(cells)
+            irradiance += strength * transport.in_cells(cells, shares)
         return np.maximum(irradiance, 0, out=irradiance)
 
     def prepare(self, light):

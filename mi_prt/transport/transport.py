@@ -47,9 +47,9 @@ class Question:
         Resolved: of parts that the transport takes.
     component : str
         One of `COMPONENTS`.
-    nearest : int
+    nearest : int, optional
         Directions that stand for a local light in transport that knows directions only
-        (Eigentransport, section 4.2.1).
+        (Eigentransport, section 4.2.1); by default the three around its own, see `arrival`.
 
     Raises
     ------
@@ -59,7 +59,7 @@ class Question:
 
     light: Any
     component: str = "total"
-    nearest: int = 1
+    nearest: int | None = None
 
     def __post_init__(self):
         if self.component not in COMPONENTS:
@@ -67,7 +67,7 @@ class Question:
                 f"component '{self.component}' is not known: use {', '.join(COMPONENTS)}"
             )
         is_count = isinstance(self.nearest, int | np.integer) and not isinstance(self.nearest, bool)
-        if not is_count or self.nearest < 1:
+        if self.nearest is not None and (not is_count or self.nearest < 1):
             raise SettingsError(
                 f"the number of nearest directions must be an integer ≥ 1, got {self.nearest!r}"
             )
