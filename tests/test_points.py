@@ -406,7 +406,7 @@ def test_auto_edge_length_comes_near_the_budget(parts, monkeypatch):
     """`auto` fills its budget of points (made small here), within what bisection and levels in
     whole numbers allow.
     """
-    monkeypatch.setattr(mi_prt.points.points, "POINT_BUDGET", 4000)
+    monkeypatch.setattr(mi_prt.points.resolution, "POINT_BUDGET", 4000)
     points = sample_points(open_scene(scene(**SCENES[parts]()[0])), "auto")
     assert 0.6 * 4000 < len(points) < 1.3 * 4000
 

@@ -25,7 +25,7 @@ from ..system.files import replacing
 from ..system.schema import is_finite
 
 FORMAT = "mi_prt asset"
-FORMAT_VERSION = 5
+FORMAT_VERSION = 6
 ALIGNMENT = 64  # bytes: where the first array begins
 MAX_HEADER = 4 << 20  # bytes: what a hostile one can make of it in memory stays below 150 MB
 BLOCK = 8 << 20  # bytes of an array that are written or checked at once

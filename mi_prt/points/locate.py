@@ -47,6 +47,8 @@ class PatchLocator(Locator):
         self._offsets = mi.UInt32(patches.offsets.astype(np.uint32))
         self._nodes = mi.UInt32(patches.nodes.astype(np.uint32))
         self._back = mi.UInt32(patches.back.astype(np.uint32))
+        self._children = mi.UInt32(patches.children.astype(np.uint32))
+        self._is_cut = bool(patches.children.any())
 
     def interpolated(self, values, pi, si, ray, active):
         """See `Locator.interpolated`; where all points around a hit are buried, all count."""
@@ -161,13 +163,17 @@ class PatchLocator(Locator):
         patch = dr.gather(mi.UInt32, self._patch, start + pi.prim_index, found)
         found &= patch != NO_PATCH
 
-        # --- position on the patch's lattice: barycentric for triangles, (u, v) for analytic shapes
+        # --- position on the patch: barycentric for triangles, (u, v) for analytic shapes
+        triangle = dr.gather(mi.UInt32, self._levels, 2 * patch + 1, found) == 0
+        back = dr.gather(mi.UInt32, self._back, patch, found)
+        uv = dr.select(triangle, pi.prim_uv, si.uv)
+        uv = mi.Point2f(dr.clip(uv.x, 0, 1), dr.clip(uv.y, 0, 1))
+        if self._is_cut:
+            patch, uv = self._descend(patch, uv, triangle, found)
         level_u = dr.gather(mi.UInt32, self._levels, 2 * patch, found)
         level_v = dr.gather(mi.UInt32, self._levels, 2 * patch + 1, found)
-        triangle = level_v == 0
-        uv = dr.select(triangle, pi.prim_uv, si.uv)
         rows = dr.select(triangle, level_u, level_v)
-        x, y = dr.clip(uv.x, 0, 1) * mi.Float(level_u), dr.clip(uv.y, 0, 1) * mi.Float(rows)
+        x, y = uv.x * mi.Float(level_u), uv.y * mi.Float(rows)
         j = dr.minimum(mi.UInt32(y), dr.maximum(rows, 1) - 1)
         columns = dr.maximum(dr.select(triangle, level_u - j, level_u), 1)
         i = dr.minimum(mi.UInt32(x), columns - 1)
@@ -183,7 +189,6 @@ class PatchLocator(Locator):
             in_triangle = j * (level_u + 1) - dr.select(j > 0, j * (j - 1) // 2, 0) + i
             return dr.select(triangle, in_triangle, j * (level_u + 1) + i)
 
-        back = dr.gather(mi.UInt32, self._back, patch, found)
         behind = si.wi.z < 0
         found &= ~behind | (back > 0)
         first = dr.gather(mi.UInt32, self._offsets, patch, found)
@@ -201,16 +206,49 @@ class PatchLocator(Locator):
         )
         return points, weights, found
 
+    def _descend(self, patch, uv, triangle, found):
+        """The patches that are not cut around hits, and the place (u, v) there; see `QuadTree`."""
+        import drjit as dr
+
+        mi = mitsuba()
+        patch, uv, active = mi.UInt32(patch), mi.Point2f(uv), mi.Bool(found)
+        child = dr.gather(mi.UInt32, self._children, patch, active)
+
+        def step(patch, child, uv):
+            x, y = 2 * uv.x, 2 * uv.y
+            i = dr.select(x < 1, mi.UInt32(0), 1)
+            j = dr.select((y < 1) | (triangle & (i > 0)), mi.UInt32(0), 1)
+            fx, fy = x - mi.Float(i), y - mi.Float(j)
+            # of a triangle: at the corner where i or j is 1, else at the first or in the middle
+            middle = triangle & (i + j == 0) & (fx + fy > 1)
+            number = dr.select(triangle, 2 * i + 3 * j, 2 * j + i) + dr.select(middle, 1, 0)
+            patch = child + number
+            uv = dr.select(middle, mi.Point2f(1 - fx, 1 - fy), mi.Point2f(fx, fy))
+            return patch, dr.gather(mi.UInt32, self._children, patch), uv
+
+        patch, _, uv = dr.while_loop(
+            (patch, child, uv),
+            lambda patch, child, uv: child > 0,
+            step,
+            labels=("patch", "child", "uv"),
+        )
+        return patch, uv
+
 
 class _FaceIndex:
     """Patches of mesh faces, found by the positions of their three corners."""
 
     def __init__(self, points):
         patches = points.layout
-        is_triangle = np.flatnonzero(patches.levels[:, 1] == 0)
-        k = patches.levels[is_triangle, 0].astype(np.int64)
-        first = patches.offsets[is_triangle]
-        corners = np.stack([first, first + k, first + (k + 1) * (k + 2) // 2 - 1], axis=-1)
+        roots = np.arange(sum(s["patches"] for s in points.surfaces))
+        is_triangle = roots[patches.levels[roots, 1] == 0]
+        # the corners of a patch that is cut are those of its children there
+        corner = np.stack([is_triangle] * 3, axis=-1)
+        while (child := patches.children[corner]).any():
+            corner = np.where(child > 0, child + np.array([0, 2, 3]), corner)
+        k = patches.levels[corner, 0].astype(np.int64)
+        last = np.stack([0 * k[:, 0], k[:, 1], (k[:, 2] + 1) * (k[:, 2] + 2) // 2 - 1], axis=-1)
+        corners = patches.offsets[corner] + last
         keys = _corner_keys(points.positions[patches.nodes[corners]])
         order = np.argsort(keys)
         self._keys, self._patches = keys[order], is_triangle[order]

@@ -6,16 +6,15 @@ from typing import ClassVar
 
 import numpy as np
 
-from ..errors import SceneError, SettingsError
+from ..errors import SceneError
 from ..system.runtime import mitsuba
 from ..system.schema import Array
 from .hull import ConvexHull
-from .lattice import Patches, node_count
+from .lattice import joined_patches
 from .layout import Layout
-from .tessellate import TESSELLATED_SHAPES, patch_levels, tessellate
+from .resolution import resolutions
+from .tessellate import tessellate
 
-POINT_BUDGET = 40_000  # points that `auto` edge length aims at, beyond the meshes' own vertices
-MAX_POINTS = 4_000_000
 # between a point's normal and its faces', above which its hemisphere counts as dipping below them
 DIPPING_DEGREES = 1.0
 
@@ -108,8 +107,9 @@ def sample_points(scene, edge_length="auto"):
     Parameters
     ----------
     scene : Scene
-    edge_length : 'auto' or float
-        Metres. `auto` takes the finest length for which a scene stays near 40,000 points.
+    edge_length : 'auto', float or str
+        See `resolutions`. `auto` takes the shortest length for which a scene stays near 40,000
+        points.
 
     Returns
     -------
@@ -120,19 +120,25 @@ def sample_points(scene, edge_length="auto"):
     SceneError
         If no shape can be sampled, a mesh is broken, or a material reflects what is not finite.
     SettingsError
-        If the edge length is not positive or would give more than 4 million points.
+        See `resolutions`.
     """
-    length = choose_edge_length(scene, edge_length)
-    surfaces, backs = [], []
+    length, found = resolutions(scene, edge_length)
+    return tessellated(scene, length, found)
+
+
+def tessellated(scene, length, found):
+    """Points at an edge length and the resolutions (dict) of surfaces, see `sample_points`."""
+    surfaces = []
     counts = {"degenerate_faces": 0, "zero_normals": 0, "flipped_normals": 0, "back_points": 0}
     total = patch_total = 0
     columns = {name: [] for name in Points.SHAPES}
-    levels, nodes = [], []
+    patches = []
     for index, surface in enumerate(scene.surfaces):
-        if surface.kind not in TESSELLATED_SHAPES:
+        if index not in found:
             surfaces.append(_describe(surface, patch_total, 0))
             continue
-        part = tessellate(surface, length)
+        tree, levels = found[index].tree, found[index].levels(length)
+        part = tessellate(surface, tree, levels)
         sides = (1, -1) if surface.material.two_sided and not part.sealed else (1,)
         n = len(part.positions)
         for side in sides:
@@ -145,23 +151,19 @@ def sample_points(scene, edge_length="auto"):
             columns["uv"].append(part.uv)
             columns["surface"].append(np.full(n, index))
             columns["buried"].append(np.zeros(n, bool))
-        surfaces.append(_describe(surface, patch_total, len(part.levels)))
-        levels.append(part.levels)
-        nodes.append(part.nodes + total)
-        backs.append(np.full(len(part.levels), n if len(sides) == 2 else 0))
+        surfaces.append(_describe(surface, patch_total, tree.roots))
+        patches.append((tree, levels, part.nodes + total, n if len(sides) == 2 else 0))
         for key, value in part.counts.items():
             counts[key] += value
         counts["back_points"] += n * (len(sides) - 1)
         total += n * len(sides)
-        patch_total += len(part.levels)
+        patch_total += tree.roots
     if not total:
         kinds = sorted({s.kind for s in scene.surfaces})
         raise SceneError(
             f"none of the scene's shapes ({', '.join(kinds)}) can be sampled: use meshes or"
             " spheres, disks, …"
         )
-    levels = np.concatenate(levels).astype(np.int32)
-    sizes = node_count(levels[:, 0].astype(np.int64), levels[:, 1].astype(np.int64))
     joined = {name: np.concatenate(values) for name, values in columns.items()}
     broken = np.flatnonzero(~np.isfinite(joined["albedo"]).all(axis=1))
     if len(broken):
@@ -175,12 +177,7 @@ def sample_points(scene, edge_length="auto"):
     )
     return Points(
         **{name: values.astype(Points.SHAPES[name].dtype) for name, values in joined.items()},
-        layout=Patches(
-            levels,
-            np.cumsum(sizes) - sizes,
-            np.concatenate(nodes).astype(np.int32),
-            np.concatenate(backs).astype(np.int32),
-        ),
+        layout=joined_patches(patches),
         surfaces=tuple(surfaces),
         report={"edge_length": length, **counts, "dipping_hemispheres": int(off.sum())},
     )
@@ -195,58 +192,6 @@ def _describe(surface, first_patch, patches):
         "first_patch": first_patch,
         "patches": patches,
     }
-
-
-def choose_edge_length(scene, edge_length="auto"):
-    """The edge length in metres that `sample_points` uses, see there."""
-    surfaces = [s for s in scene.surfaces if s.kind in TESSELLATED_SHAPES]
-    if edge_length != "auto":
-        try:
-            length = float(edge_length)
-        except (TypeError, ValueError):
-            raise SettingsError(
-                f"edge length '{edge_length}' is neither 'auto' nor a number of metres"
-            ) from None
-        if not (np.isfinite(length) and length > 0):
-            raise SettingsError(f"edge length {edge_length} must be a positive number of metres")
-        count = _count(surfaces, length)
-        if count > MAX_POINTS:
-            raise SettingsError(
-                f"edge length {length:g} m gives about {count:,} points, above {MAX_POINTS:,}: use"
-                " a longer one"
-            )
-        return length
-    coarsest, finest = scene.scale / 4, scene.scale / 400
-    budget = max(POINT_BUDGET, _count(surfaces, np.inf) + POINT_BUDGET // 4)
-    if _count(surfaces, finest) <= budget:
-        return finest
-    for _ in range(12):  # bisection to 0.1 %
-        middle = np.sqrt(coarsest * finest)
-        if _count(surfaces, middle) > budget:
-            finest = middle
-        else:
-            coarsest = middle
-    return float(coarsest)
-
-
-def _count(surfaces, edge_length):
-    """About the number of points at an edge length: nodes, less those shared by neighbouring
-    patches.
-    """
-    total = 0
-    for surface in surfaces:
-        levels = patch_levels(surface, edge_length).astype(np.int64)
-        sides = 2 if surface.material.two_sided and surface.kind != "Sphere" else 1
-        if surface.kind == "mesh":
-            # v vertices, k − 1 nodes inside each edge (shared by two faces), the rest inside the
-            # faces.
-            k = levels[:, 0]
-            total += sides * int(
-                surface.shape.vertex_count() + (1.5 * (k - 1) + (k - 1) * (k - 2) // 2).sum()
-            )
-        else:
-            total += sides * int(node_count(levels[:, 0], levels[:, 1]).sum())
-    return total
 
 
 def _albedo(surface, part, side):

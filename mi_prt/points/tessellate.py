@@ -7,9 +7,11 @@ import numpy as np
 from ..errors import SceneError
 from ..scene.scene import mesh_arrays
 from ..scene.traversal import transform_of
-from .lattice import Patches, lattice_nodes, lattice_triangles, node_count
+from .lattice import lattice_nodes, lattice_triangles, leaf_triangles, node_count
+from .quadtree import with_middles
 
 MAX_LEVEL = 4096
+_FINEST = 1 << 30  # steps along u and v, to which places of nodes are rounded to compare them
 # Least levels (k_u, k_v) that keep the polygonal outline of a curved shape smooth, for any edge
 # length.
 _LEAST_LEVELS = {"Sphere": (32, 16), "Cylinder": (32, 1), "Disk": (1, 32)}
@@ -34,8 +36,8 @@ class SurfacePoints:
         A face that the point lies on.
     local_positions : (n, 3) float64
         In the frame of the shape, where its attributes are looked up.
-    levels : (p, 2), nodes : (t,)
-        Patches as in `Patches`, with node indices local to this surface.
+    levels : (l, 2), nodes : (t,)
+        Patches that are not cut as in `Patches`, with node indices local to this surface.
     sealed : bool
         Whether the surface encloses a volume with the reflecting side outside, so that its back is
         never seen.
@@ -57,50 +59,65 @@ class SurfacePoints:
     counts: dict
 
 
-def patch_levels(surface, edge_length):
-    """Levels (p, 2) of a surface's patches so that no edge of the lattice exceeds `edge_length`
-    metres.
+def patch_levels(surface, tree, edge_lengths):
+    """Levels (l, 2) of the patches of a surface that are not cut, so that no edge of their lattices
+    exceeds `edge_lengths` (l,), metres.
 
     Raises
     ------
     SceneError
         If a mesh has positions that are NaN or infinite.
     """
+    leaves = tree.leaves
+    parts = 2.0 ** tree.depth[leaves]
     if surface.kind == "mesh":
-        corners = _world_corners(surface)
-        if not np.isfinite(corners).all():
-            raise SceneError(
-                f"mesh '{surface.name}' has positions that are NaN or infinite: repair it first"
-            )
-        longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).max(axis=1)
-        k = np.clip(np.ceil(longest / edge_length - 1e-6), 1, MAX_LEVEL).astype(np.int32)
+        # the children of a triangle are like it, and half as large
+        longest = longest_edges(surface)[tree.root[leaves]] / parts
+        k = np.clip(np.ceil(longest / edge_lengths - 1e-6), 1, MAX_LEVEL).astype(np.int32)
         return np.stack([k, np.zeros_like(k)], axis=-1)
-    along_u, along_v = _analytic_lengths(surface)
-    least = np.array(_LEAST_LEVELS[surface.kind])
-    wanted = np.ceil(np.array([along_u, along_v]) / edge_length - 1e-6)
-    return np.clip(wanted, least, MAX_LEVEL).astype(np.int32)[None]
+    least = np.ceil(np.array(_LEAST_LEVELS[surface.kind]) / parts[:, None])
+    wanted = np.array(analytic_lengths(surface)) / (parts * edge_lengths)[:, None]
+    return np.clip(np.ceil(wanted - 1e-6), least, MAX_LEVEL).astype(np.int32)
 
 
-def tessellate(surface, edge_length):
+def longest_edges(surface):
+    """The longest edge (f,) of each face of a mesh, metres.
+
+    Raises
+    ------
+    SceneError
+        If a mesh has positions that are NaN or infinite.
+    """
+    corners = world_corners(surface)
+    if not np.isfinite(corners).all():
+        raise SceneError(
+            f"mesh '{surface.name}' has positions that are NaN or infinite: repair it first"
+        )
+    return np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).max(axis=1)
+
+
+def tessellate(surface, tree, levels):
     """Points of a surface, see SurfacePoints.
 
-    Raises
-    ------
-    SceneError
-        If a mesh has positions that are NaN or infinite.
+    Parameters
+    ----------
+    surface : Surface
+    tree : QuadTree
+        Of its faces, or of the (u, v) domain of an analytic shape.
+    levels : (l, 2) int
+        Of the patches that are not cut, see `patch_levels`.
     """
-    levels = patch_levels(surface, edge_length)
     return (
-        _tessellate_mesh(surface, levels)
+        _tessellate_mesh(surface, tree, levels)
         if surface.kind == "mesh"
-        else _tessellate_analytic(surface, levels)
+        else _tessellate_analytic(surface, tree, levels)
     )
 
 
 # --- meshes ---------------------------------------------------------------------------------------
 
 
-def _tessellate_mesh(surface, levels):
+def _tessellate_mesh(surface, tree, levels):
     positions, faces, normals, uv = mesh_arrays(surface.shape)
     world = _transformed(positions, surface.to_world)
     face_normals, face_areas = _face_geometry(world, faces)
@@ -124,8 +141,16 @@ def _tessellate_mesh(surface, levels):
         # inverse transpose, for row vectors
         normals = normals @ np.linalg.inv(surface.to_world[:3, :3])
     uv = np.zeros((len(world), 2), np.float32) if uv is None else uv
+    whole = faces[~degenerate]
 
-    face, barycentric, shares, identity = _mesh_nodes(faces, levels[:, 0], degenerate)
+    leaves = tree.leaves
+    root, corners = tree.root[leaves], tree.barycentrics()[leaves]
+    patches, ends = tree.triangles(faces, len(world))
+    patch, barycentric, shares, identity = _mesh_nodes(
+        patches[leaves], levels[:, 0], degenerate[root]
+    )
+    face = root[patch]
+    in_face = np.einsum("tc,tcx->tx", barycentric, corners[patch])
     count = int(identity.max(initial=-1)) + 1
     if count == 0 or degenerate.all():
         raise SceneError(f"mesh '{surface.name}' has no face of positive area: remove it")
@@ -134,9 +159,10 @@ def _tessellate_mesh(surface, levels):
     first[identity[used][::-1]] = np.flatnonzero(used)[::-1]
 
     def at_points(values):
-        return np.einsum("nc,ncx->nx", barycentric[first], values[faces[face[first]]])
+        values = with_middles(values, ends)[patches[leaves[patch[first]]]]
+        return np.einsum("nc,ncx->nx", barycentric[first], values)
 
-    node_areas = shares * face_areas[face]
+    node_areas = shares * (face_areas[root] / 4.0 ** tree.depth[leaves])[patch]
     areas = np.bincount(identity[used], node_areas[used], count)
     geometric = np.stack(
         [
@@ -153,20 +179,20 @@ def _tessellate_mesh(surface, levels):
     senses = np.unique(np.sign(facing))
     nodes = identity[_patch_order(levels[:, 0])]
     placed = at_points(world)
+    on_rim = ((in_face == 0) & _rim_edges(faces, degenerate)[face]).any(axis=1)
+    rim = np.bincount(identity[used], on_rim[used], count) > 0
     return SurfacePoints(
         positions=placed,
         normals=shading,
         geometric_normals=np.where(facing[:, None] < 0, -geometric, geometric),
-        insets=_insets(placed, geometric, levels, nodes),
+        insets=_insets(placed, geometric, rim, levels, nodes),
         uv=at_points(uv).astype(np.float32),
         areas=areas,
         primitives=face[first],
         local_positions=at_points(positions),
         levels=levels,
         nodes=nodes,
-        sealed=(
-            _is_sealed(world, faces[~degenerate], senses[0] * sign) if len(senses) == 1 else False
-        ),
+        sealed=(_is_sealed(world, whole, senses[0] * sign) if len(senses) == 1 else False),
         counts={
             "degenerate_faces": int(degenerate.sum()),
             "zero_normals": zero,
@@ -254,7 +280,8 @@ def _split_by_normal(faces, face_normals):
     return inverse.reshape(faces.shape), split[:, 0]
 
 
-def _world_corners(surface):
+def world_corners(surface):
+    """Corners (f, 3, 3) of a mesh's faces in the world."""
     positions, faces, _, _ = mesh_arrays(surface.shape)
     return _transformed(positions, surface.to_world)[faces]
 
@@ -284,22 +311,19 @@ def _repaired_normals(normals, faces, weighted_face_normals):
     return np.where(broken[:, None], _unit(around), normals), int(broken.sum())
 
 
-def _insets(positions, normals, levels, nodes):
-    """Unit vectors (n, 3) from points on the rim toward the triangles they belong to, along the
-    surface; 0 elsewhere.
+def _rim_edges(faces, degenerate):
+    """Whether the edge opposite to each corner (f, 3) is of no other face."""
+    edges = np.sort(faces[:, [[1, 2], [2, 0], [0, 1]]], axis=2)
+    keys = edges[..., 0] * (int(faces.max(initial=0)) + 1) + edges[..., 1]
+    whole, uses = np.unique(keys[~degenerate], return_counts=True)
+    return np.isin(keys, whole[uses == 1])
+
+
+def _insets(positions, normals, rim, levels, nodes):
+    """Unit vectors (n, 3) from points on the `rim` (n,) toward the triangles they belong to, along
+    the surface; 0 elsewhere.
     """
-    counts = node_count(levels[:, 0].astype(np.int64), levels[:, 1].astype(np.int64))
-    triangles = Patches(
-        levels, np.cumsum(counts) - counts, nodes, np.zeros(0, np.int32)
-    ).triangles()
-    edges = np.sort(
-        np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1
-    )
-    keys, uses = np.unique(
-        edges[:, 0].astype(np.int64) * len(positions) + edges[:, 1], return_counts=True
-    )
-    rim = np.zeros(len(positions), bool)
-    rim[np.concatenate(np.divmod(keys[uses == 1], len(positions)))] = True
+    triangles = leaf_triangles(levels, nodes)[0]
     inward = np.zeros_like(positions)
     centres = positions[triangles].mean(axis=1)
     for corner in triangles.T:
@@ -329,23 +353,23 @@ def _is_sealed(positions, faces, sign):
 # --- analytic shapes ------------------------------------------------------------------------------
 
 
-def _tessellate_analytic(surface, levels):
-    nodes = lattice_nodes(*levels[0])
+def _tessellate_analytic(surface, tree, levels):
+    nodes = domain_nodes(tree, levels)
     # Nodes on the seam and at the poles of a shape lie at one place: one point each.
-    last_u, last_v = levels[0]
-    i, j = nodes.T.copy()
+    u, v = np.round(nodes * _FINEST).astype(np.int64).T
     if surface.kind in ("Sphere", "Cylinder"):
-        i[i == last_u] = 0
+        u[u == _FINEST] = 0
     if surface.kind == "Sphere":
-        i[(j == 0) | (j == last_v)] = 0
+        u[(v == 0) | (v == _FINEST)] = 0
     if surface.kind == "Disk":
-        j[(j == last_v) | (i == 0)] = 0
-    _, first, identity = np.unique(j * (last_u + 1) + i, return_index=True, return_inverse=True)
-    uv = (nodes[first] / levels[0]).astype(np.float32)
+        v[(v == _FINEST) | (u == 0)] = 0
+    _, first, identity = np.unique(v * (_FINEST + 1) + u, return_index=True, return_inverse=True)
+    uv = nodes[first].astype(np.float32)
+    rim = {"Sphere": u < 0, "Cylinder": (v == 0) | (v == _FINEST), "Disk": u == _FINEST}
     local, normals = _evaluate(surface, uv)
     world = _transformed(local, surface.to_world)
     normals = _unit(normals @ np.linalg.inv(surface.to_world[:3, :3]))
-    triangles = identity[lattice_triangles(*levels[0])]
+    triangles = leaf_triangles(levels, identity)[0]
     areas = np.bincount(
         triangles.ravel(), np.repeat(_face_geometry(world, triangles)[1] / 3, 3), len(first)
     )
@@ -353,7 +377,7 @@ def _tessellate_analytic(surface, levels):
         positions=world,
         normals=normals,
         geometric_normals=normals,
-        insets=_insets(world, normals, levels, identity),
+        insets=_insets(world, normals, rim[surface.kind][first], levels, identity),
         uv=uv,
         areas=areas,
         primitives=np.zeros(len(first), np.int64),
@@ -396,7 +420,21 @@ def _on_circle(turn, radius, height):
     return np.stack([radius * np.cos(phi), radius * np.sin(phi), height], axis=-1)
 
 
-def _analytic_lengths(surface):
+def domain_nodes(tree, levels):
+    """Places (t, 2) in (u, v) of the nodes of an analytic shape's patches that are not cut."""
+    parts = []
+    for (low_u, low_v, high_u, high_v), level in zip(tree.rectangles()[tree.leaves], levels):
+        low, size = np.array([low_u, low_v]), np.array([high_u - low_u, high_v - low_v])
+        parts.append(low + lattice_nodes(*level) / level * size)
+    return np.concatenate(parts)
+
+
+def places_of(surface, uv):
+    """Places (k, 3) of an analytic shape at some (u, v), in the world."""
+    return _transformed(_evaluate(surface, uv)[0], surface.to_world)
+
+
+def analytic_lengths(surface):
     """Longest extents (u, v) of the shape along its parameters, in metres."""
     side = 33
     grid = np.stack(np.meshgrid(np.linspace(0, 1, side), np.linspace(0, 1, side)), axis=-1).reshape(

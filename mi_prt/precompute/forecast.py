@@ -6,7 +6,7 @@ from dataclasses import asdict
 import numpy as np
 
 from ..asset.provenance import emitter_records, left_out
-from ..points.points import POINT_BUDGET
+from ..points.resolution import POINT_BUDGET
 from ..scene.scene import open_scene
 from ..system.memory import free_bytes, resident_bytes
 from .plan import make_plan
@@ -100,8 +100,8 @@ def _settings(plan, points, reasons, costs):
     groups = {"general", chosen["points"], *plan.transports}
     if chosen["edge_length"] == "auto" and "edge_length" in points.report:
         reasons["edge_length"] = (
-            "finest of 1/400…1/4 of the scene's scale that keeps it near"
-            f" {POINT_BUDGET:,} points beyond its vertices"
+            f"the shortest that keeps it near {POINT_BUDGET:,} points beyond its vertices; longer on"
+            " wide faces far from objects"
         )
     if "edge_length" in points.report:
         chosen["edge_length"] = round(points.report["edge_length"], 6)

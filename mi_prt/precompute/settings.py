@@ -10,6 +10,7 @@ from ..basis.target import Target
 from ..directions import parse_directions
 from ..directions.hemisphere import Hemisphere
 from ..errors import SettingsError
+from ..points.resolution import parse_edge_length
 from .options import Choice, Flag, Integer, Option, Real
 
 DEFAULT_VARIANCE = 0.95
@@ -45,6 +46,16 @@ class _Transports(Option):
         return ",".join(name for name in TRANSPORTS if name in names)
 
 
+class _EdgeLength(Option):
+    """`auto` or metres, and metres of shapes by name, with commas between them."""
+
+    def check(self, value):
+        """See `Option.check`."""
+        base, named = parse_edge_length(value)
+        lengths = [f"{name}={length!r}" for name, length in named.items()]
+        return ",".join([str(base), *lengths]) if named else base
+
+
 AUTO = ("auto",)
 OPTIONS = (
     _Transports(
@@ -78,13 +89,13 @@ OPTIONS = (
         among=QUANTIZATIONS,
     ),
     # --- points
-    Real(
+    _EdgeLength(
         "edge_length",
         "auto",
-        "Coarse faces are tessellated down to this.",
-        "auto|METRES",
+        "Coarse faces are tessellated down to this; auto: finely near objects, coarsely far from"
+        " them; of shapes by name: 0.1,ground=5.",
+        "auto|METRES|NAME=METRES,…",
         "vertices",
-        others=AUTO,
     ),
     Integer("count", 45_000, "Samples.", "N", "samples", least=1, most=MAX_POINTS),
     # --- light from afar

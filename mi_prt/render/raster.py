@@ -19,7 +19,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..errors import SceneError, SettingsError
-from ..points.lattice import lattice_nodes, lattice_triangles
 from ..system.runtime import mitsuba
 from .canvas import draw, drawing, make_current, new_primitive, open_canvas
 from .display import display
@@ -255,12 +254,9 @@ def _textured_triangles(points, index, fronts):
     if points.surfaces[index]["kind"] == "mesh":
         vertices, triangles = np.unique(fronts, return_inverse=True)
         return vertices, points.uv[vertices], triangles.reshape(-1, 3)
-    # Points on the seam of an analytic shape have two uv: each node of its patch is a vertex.
-    patches, patch = points.layout, points.surfaces[index]["first_patch"]
-    levels = patches.levels[patch]
-    nodes = lattice_nodes(*levels)
-    vertices = patches.nodes[patches.offsets[patch] :][: len(nodes)]
-    return vertices, (nodes / levels).astype(np.float32), lattice_triangles(*levels)
+    # Points on the seam of an analytic shape have two uv: each node of its patches is a vertex.
+    nodes, uv, triangles = points.layout.domain(points.surfaces[index]["first_patch"])
+    return nodes, uv.astype(np.float32), triangles
 
 
 def _shading(scene, points):
