@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..render.image import check_samples
-from ..scene.scene import scale_of
+from ..scene.bounds import scale_of
 from ..system.runtime import mitsuba
 
 LANES = 1 << 21

@@ -95,20 +95,20 @@ class Patches(Layout):
         """
         u, v = self.levels.astype(np.int64).T
         sizes = np.where(self.children > 0, 0, node_count(u, v))
+        roots = len(sizes) - CHILDREN * int((self.children > 0).sum())
+        first = np.sort(self.children[self.children > 0])
         if not len(u):
             raise ValueError("layout/levels are of no patch")
+        if roots < 1 or not np.array_equal(first, np.arange(roots, len(sizes), CHILDREN)):
+            raise ValueError("layout/children are not the patches behind the roots, each once")
+        if (self.children[self.children > 0] <= np.flatnonzero(self.children)).any():
+            raise ValueError("layout/children come before the patch that is cut into them")
         if (u < 1).any() or (self.offsets != np.cumsum(sizes) - sizes).any():
             raise ValueError("layout/offsets do not fit the levels of the patches")
         if sizes.sum() != len(self.nodes):
             raise ValueError(f"layout/nodes are {len(self.nodes)} instead of {sizes.sum()}")
         if (self.nodes + np.repeat(self.back.astype(np.int64), sizes) >= len(points)).any():
             raise ValueError("layout/back leads beyond the points")
-        roots = len(sizes) - CHILDREN * int((self.children > 0).sum())
-        first = np.sort(self.children[self.children > 0])
-        if roots < 1 or not np.array_equal(first, np.arange(roots, len(sizes), CHILDREN)):
-            raise ValueError("layout/children are not the patches behind the roots, each once")
-        if (self.children[self.children > 0] <= np.flatnonzero(self.children)).any():
-            raise ValueError("layout/children come before the patch that is cut into them")
         first = 0
         for surface in points.surfaces:
             if surface["first_patch"] != first:

@@ -12,7 +12,7 @@ from ..system.schema import Array
 from .hull import ConvexHull
 from .lattice import joined_patches
 from .layout import Layout
-from .resolution import resolutions
+from .resolution import choose_resolution
 from .tessellate import tessellate
 
 # between a point's normal and its faces', above which its hemisphere counts as dipping below them
@@ -108,7 +108,7 @@ def sample_points(scene, edge_length="auto"):
     ----------
     scene : Scene
     edge_length : 'auto', float or str
-        See `resolutions`. `auto` takes the shortest length for which a scene stays near 40,000
+        See `choose_resolution`; `auto` is the shortest length for which a scene stays near 40,000
         points.
 
     Returns
@@ -120,14 +120,14 @@ def sample_points(scene, edge_length="auto"):
     SceneError
         If no shape can be sampled, a mesh is broken, or a material reflects what is not finite.
     SettingsError
-        See `resolutions`.
+        See `choose_resolution`.
     """
-    length, found = resolutions(scene, edge_length)
-    return tessellated(scene, length, found)
+    return tessellated(scene, choose_resolution(scene, edge_length))
 
 
-def tessellated(scene, length, found):
-    """Points at an edge length and the resolutions (dict) of surfaces, see `sample_points`."""
+def tessellated(scene, resolution):
+    """Points at a Resolution, see `sample_points`."""
+    length, found = resolution.edge_length, resolution.surfaces
     surfaces = []
     counts = {"degenerate_faces": 0, "zero_normals": 0, "flipped_normals": 0, "back_points": 0}
     total = patch_total = 0

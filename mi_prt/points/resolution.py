@@ -17,6 +17,7 @@ WIDE_FACE = 1 / 16  # of the largest object's size; edges of smaller faces are a
 MOST_WIDE_FACES = 4096
 MOST_PATCHES = 1 << 16  # that wide faces are cut into
 UNLIKE = 2.0  # ratio of edge lengths within a patch, above which it is cut
+CONTACT = 2.0  # edges along an object that show where it touches others
 _STEPS = 40  # of the bisection
 
 
@@ -49,6 +50,8 @@ class SurfaceResolution:
         surface, levels = self.surface, self.levels(edge_length).astype(np.int64)
         sides = 2 if surface.material.two_sided and surface.kind != "Sphere" else 1
         if surface.kind != "mesh":
+            if self.tree.cuts:  # most nodes are shared by four patches
+                return sides * int((levels[:, 0] * levels[:, 1]).sum())
             return sides * int(node_count(levels[:, 0], levels[:, 1]).sum())
         # v vertices, k − 1 nodes inside each edge (shared by two faces), the rest inside the faces;
         # a cut makes three vertices, shared by two faces
@@ -77,8 +80,53 @@ class SurfaceResolution:
         return replace(self, tree=self.tree.cut(leaves), growth=np.concatenate([kept, children]))
 
 
-def resolutions(scene, edge_length="auto"):
-    """Edge length in metres, and the resolution of each tessellated surface, by its number.
+@dataclass(frozen=True, eq=False)
+class Resolution:
+    """Resolution of all surfaces of a scene.
+
+    Parameters
+    ----------
+    edge_length : float
+        Near objects, metres.
+    surfaces : dict of SurfaceResolution
+        By number; only those that are tessellated.
+    sizes : (o,)
+        Of the objects of the scene, metres; none where they were not looked at.
+    """
+
+    edge_length: float
+    surfaces: dict
+    sizes: np.ndarray
+
+    def count(self, edge_length=None):
+        """About the number of points, at another edge length if one is given."""
+        length = self.edge_length if edge_length is None else edge_length
+        return sum(x.count(length) for x in self.surfaces.values())
+
+    def cut(self, patches):
+        """With some more patches cut, {number of a surface: its leaves}."""
+        finer = {i: self.surfaces[i].cut(leaves) for i, leaves in patches.items()}
+        return replace(self, surfaces=self.surfaces | finer)
+
+    @property
+    def unresolved(self):
+        """Which objects are too small for the edge length to show where they touch others, in
+        words; '' where it does for most.
+        """
+        small = self.sizes < CONTACT * self.edge_length
+        if small.mean() <= 0.5 if len(small) else True:
+            return ""
+        wanted = float(np.median(self.sizes)) / CONTACT
+        return (
+            f"edges of {self.edge_length:.3g} m are too long to show the contact of"
+            f" {int(small.sum()):,} of {len(small):,} objects, half of which are smaller than"
+            f" {np.median(self.sizes):.3g} m: --edge-length {wanted:.2g} would"
+            f" (about {self.count(wanted):,} points)"
+        )
+
+
+def choose_resolution(scene, edge_length="auto"):
+    """The resolution of a scene's surfaces.
 
     Parameters
     ----------
@@ -90,8 +138,7 @@ def resolutions(scene, edge_length="auto"):
 
     Returns
     -------
-    length : float
-    found : dict of SurfaceResolution
+    Resolution
 
     Raises
     ------
@@ -108,9 +155,11 @@ def resolutions(scene, edge_length="auto"):
         roots = surface.shape.face_count() if surface.kind == "mesh" else 1
         found[i] = SurfaceResolution(surface, QuadTree(roots), np.ones(roots), own.get(i))
     if base == "auto":
-        _grow(found)
-        return _fitting(found), found
-    count = sum(x.count(base) for x in found.values())
+        objects = Objects([x.surface for x in found.values()])
+        _grow(found, objects)
+        return Resolution(_fitting(found), found, objects.sizes)
+    chosen = Resolution(base, found, np.zeros(0))
+    count = chosen.count()
     if count > MAX_POINTS:
         most = max(found.values(), key=lambda x: x.count(base)).surface.name
         raise SettingsError(
@@ -118,7 +167,7 @@ def resolutions(scene, edge_length="auto"):
             f" longer one, auto, which is long only far from objects, or one for '{most}' of its"
             f" own (--edge-length {base:g},{most}={max(base * 10, 1):g})"
         )
-    return base, found
+    return chosen
 
 
 def parse_edge_length(value):
@@ -170,9 +219,8 @@ def _own_lengths(surfaces, named):
     return found
 
 
-def _grow(found):
+def _grow(found, objects):
     """Cut wide faces where the growth of edge lengths calls for it."""
-    objects = Objects([x.surface for x in found.values()])
     for (i, resolution), parts in zip(list(found.items()), objects.parts):
         if resolution.own is None:
             found[i] = _grown(resolution, parts, objects)

@@ -59,7 +59,10 @@ class Objects:
     ----------
     parts : list of (f,) int
         For each surface, the part that its faces belong to.
+    sizes : (o,)
+        Diagonals of the boxes around the parts, metres.
     boxes : Boxes
+        Around them, or around several of them.
     """
 
     def __init__(self, surfaces):
@@ -77,7 +80,8 @@ class Objects:
             total += count
         low, high = np.array(low).reshape(-1, 3), np.array(high).reshape(-1, 3)
         whole = Boxes(low, high, np.arange(total))
-        self.largest = whole.sizes.max(initial=0.0)
+        self.sizes = whole.sizes
+        self.largest = self.sizes.max(initial=0.0)
         self.boxes = _few(_joined([whole, *self._details(whole, faces)]))
 
     def _details(self, whole, faces):

@@ -76,7 +76,7 @@ def patch_levels(surface, tree, edge_lengths):
         k = np.clip(np.ceil(longest / edge_lengths - 1e-6), 1, MAX_LEVEL).astype(np.int32)
         return np.stack([k, np.zeros_like(k)], axis=-1)
     least = np.ceil(np.array(_LEAST_LEVELS[surface.kind]) / parts[:, None])
-    wanted = np.array(analytic_lengths(surface)) / (parts * edge_lengths)[:, None]
+    wanted = _lengths(surface, tree) / np.asarray(edge_lengths)[:, None]
     return np.clip(np.ceil(wanted - 1e-6), least, MAX_LEVEL).astype(np.int32)
 
 
@@ -432,6 +432,21 @@ def domain_nodes(tree, levels):
 def places_of(surface, uv):
     """Places (k, 3) of an analytic shape at some (u, v), in the world."""
     return _transformed(_evaluate(surface, uv)[0], surface.to_world)
+
+
+def _lengths(surface, tree):
+    """Longest extents (l, 2) along u and v of the patches that are not cut, metres."""
+    if not tree.cuts:
+        return np.array([analytic_lengths(surface)])
+    bounds, side = tree.rectangles()[tree.leaves], 5
+    steps = np.linspace(0, 1, side)
+    grid = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+    uv = bounds[:, None, :2] + grid * (bounds[:, None, 2:] - bounds[:, None, :2])
+    world = places_of(surface, uv.reshape(-1, 2)).reshape(-1, side, side, 3)
+    along = [
+        np.linalg.norm(np.diff(world, axis=a), axis=-1).sum(axis=a).max(axis=1) for a in (2, 1)
+    ]
+    return np.stack(along, axis=1)
 
 
 def analytic_lengths(surface):

@@ -100,8 +100,8 @@ def _settings(plan, points, reasons, costs):
     groups = {"general", chosen["points"], *plan.transports}
     if chosen["edge_length"] == "auto" and "edge_length" in points.report:
         reasons["edge_length"] = (
-            f"the shortest that keeps it near {POINT_BUDGET:,} points beyond its vertices; longer on"
-            " wide faces far from objects"
+            f"the shortest that keeps it near {POINT_BUDGET:,} points beyond its vertices; longer"
+            " on wide faces far from objects"
         )
     if "edge_length" in points.report:
         chosen["edge_length"] = round(points.report["edge_length"], 6)

@@ -11,11 +11,12 @@ from ..asset.asset import Asset
 from ..asset.provenance import describe_scene, emitter_records
 from ..errors import SettingsError
 from ..points.clusters import make_clusters
-from ..points.points import Points, sample_points
+from ..points.points import Points
 from ..points.samples import scatter_points
 from ..scene.scene import open_scene
 from ..system.memory import free_bytes, parse_bytes, resident_bytes
 from ..system.runtime import count_kernels, peak_memory_bytes, versions
+from .exposed import exposed_points
 from .job import BUILDERS, Clock, Job
 from .plan import make_plan
 from .workspace import durable, temporary
@@ -176,7 +177,7 @@ def make_points(scene, settings, clustered, progress):
 
 
 def _vertices(scene, settings, clustered, progress):
-    points = sample_points(scene, settings.edge_length)
+    points = exposed_points(scene, settings.edge_length)
     count = _cluster_count(len(points), settings)
     clusters = make_clusters(points, count, settings.seed) if clustered else None
     return points, clusters, None

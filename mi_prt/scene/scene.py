@@ -12,6 +12,7 @@ import numpy as np
 
 from ..errors import SceneError
 from ..system.runtime import a_worker_at_least, mitsuba
+from .bounds import scale_of
 from .own_lights import list_own_lights
 from .rebuild import check_can_be_copied, kept_parts, rebuilt_scene
 from .surface import list_surfaces
@@ -235,28 +236,6 @@ def _loaded(what, load, *arguments, **parameters):
     if not isinstance(scene, mitsuba().Scene):
         raise SceneError(f"{what} is a {type(scene).__name__}, not a scene")
     return scene
-
-
-def scale_of(mi_scene):
-    """Length that offsets and tolerances are measured by: the bounding box's diagonal or the
-    largest coordinate.
-
-    Raises
-    ------
-    SceneError
-        If the bounding box is not finite.
-    """
-    box = mi_scene.bbox()
-    low, high = (
-        np.array(box.min, dtype=np.float64).ravel(),
-        np.array(box.max, dtype=np.float64).ravel(),
-    )
-    if not np.isfinite([low, high]).all():
-        raise SceneError(
-            f"the scene's bounding box {low}…{high} is not finite: a mesh holds NaN or infinite"
-            " positions"
-        )
-    return float(max(np.linalg.norm(high - low), np.abs([low, high]).max()))
 
 
 def mesh_arrays(mesh):

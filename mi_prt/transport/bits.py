@@ -10,7 +10,7 @@ from ..system.runtime import mitsuba
 
 LANES = 1 << 22  # rays of a wavefront: a few million keep both cores busy in a few hundred MB
 RAY_OFFSET = 2e-5  # share of the scene's scale by which rays start off the surface
-BURIED_RAYS = 64
+BURIED_RAYS, FIRST_RAYS = 64, 8
 
 
 class DirectSampler:
@@ -140,9 +140,9 @@ class VisibilityTracer:
 def find_buried(scene, points, dark=None, lanes=LANES):
     """Which points without any sky lie inside or against other geometry.
 
-    A point is buried when every ray of its hemisphere ends on the back of a face or nearer than
-    1e-3 of the scene's scale: feet below the ground, a floor under a box. A dark corner, which
-    other light may reach, is not.
+    A point is buried when every ray of its hemisphere ends on the back of a face, or nearer than
+    1e-3 of the scene's scale and a tenth of the distance between points there: feet below the
+    ground, a floor under a box. A dark corner, which other light may reach, is not.
 
     Parameters
     ----------
@@ -158,27 +158,41 @@ def find_buried(scene, points, dark=None, lanes=LANES):
     -------
     (n,) bool
     """
-    import drjit as dr
-
-    mi = mitsuba()
     buried = np.zeros(len(points), bool)
     index = np.arange(len(points)) if dark is None else np.flatnonzero(dark)
-    if not len(index):
-        return buried
     # A fixed spherical Fibonacci set, flipped into each hemisphere.
     z = 1 - (np.arange(BURIED_RAYS) + 0.5) * 2 / BURIED_RAYS
     phi = np.arange(BURIED_RAYS) * np.pi * (3 - 5**0.5)
     vectors = np.stack(
         [np.sqrt(1 - z * z) * np.cos(phi), np.sqrt(1 - z * z) * np.sin(phi), z], axis=-1
     ).astype(np.float32)
-    step = max(1, lanes // BURIED_RAYS)
-    for chunk in np.split(index, range(step, len(index), step)):
-        normals = np.repeat(points.normals[chunk], BURIED_RAYS, axis=0)
-        toward = np.tile(vectors, (len(chunk), 1))
-        toward *= np.where(np.sum(toward * normals, axis=1) < 0, -1, 1)[:, None].astype(np.float32)
-        origins = points.at(chunk).ray_origins(RAY_OFFSET * scene.scale)
-        ray = mi.Ray3f(mi.Point3f(np.repeat(origins, BURIED_RAYS, axis=0).T), mi.Vector3f(toward.T))
-        hit = scene.occluders.ray_intersect(ray)
-        inside = hit.is_valid() & ((dr.dot(hit.n, ray.d) > 0) | (hit.t < 1e-3 * scene.scale))
-        buried[chunk] = np.array(inside).reshape(len(chunk), BURIED_RAYS).all(axis=1)
+    first = np.zeros(BURIED_RAYS, bool)
+    first[:: BURIED_RAYS // FIRST_RAYS] = True
+    # Most points are told free by a few rays; the others need them all.
+    for some in (vectors[first], vectors[~first]):
+        step = max(1, lanes // len(some))
+        blocks = np.split(index, range(step, len(index), step)) if len(index) else []
+        inside = [_all_inside(scene, points.at(block), some) for block in blocks]
+        index = index[np.concatenate(inside)] if inside else index
+    buried[index] = True
     return buried
+
+
+def _all_inside(scene, points, vectors):
+    """Whether rays from points along all vectors (r, 3), flipped into their hemispheres, end inside
+    of or against geometry.
+    """
+    import drjit as dr
+
+    mi = mitsuba()
+    count = len(vectors)
+    normals = np.repeat(points.normals, count, axis=0)
+    toward = np.tile(vectors, (len(points), 1))
+    toward *= np.where(np.sum(toward * normals, axis=1) < 0, -1, 1)[:, None].astype(np.float32)
+    origins = points.ray_origins(RAY_OFFSET * scene.scale)
+    ray = mi.Ray3f(mi.Point3f(np.repeat(origins, count, axis=0).T), mi.Vector3f(toward.T))
+    hit = scene.occluders.ray_intersect(ray)
+    near = np.minimum(1e-3 * scene.scale, 0.1 * np.sqrt(points.areas)).astype(np.float32)
+    near = mi.Float(np.repeat(near, count))
+    inside = hit.is_valid() & ((dr.dot(hit.n, ray.d) > 0) | (hit.t < near))
+    return np.array(inside).reshape(-1, count).all(axis=1)
