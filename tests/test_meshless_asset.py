@@ -7,13 +7,12 @@ import itertools
 import json
 import os
 import signal
-import subprocess
-import sys
 import time
 
 import numpy as np
 import pytest
 from conftest import arrays_of, cube, diffuse, rectangle, rewritten, scene, uniform_sky
+from forked import Starter
 
 import mi_prt
 from mi_prt import (
@@ -95,6 +94,12 @@ def files(assets, tmp_path_factory):
     for name, asset in assets.items():
         asset.save(paths[name])
     return paths
+
+
+@pytest.fixture(scope="module")
+def starter():
+    with Starter("test_meshless_asset") as starter:
+        yield starter
 
 
 def values_of(asset):
@@ -456,8 +461,16 @@ BEYOND = [
 ]
 
 
+def load(path):
+    """Loads a file that is to be refused. In a process of its own."""
+    try:
+        mi_prt.load(path)
+    except AssetError:
+        print("refused")
+
+
 @pytest.mark.parametrize(("name", "value"), BEYOND)
-def test_places_beyond_the_arrays(files, tmp_path, name, value):
+def test_places_beyond_the_arrays(files, starter, tmp_path, name, value):
     """Indices that point elsewhere, or all to one place: an AssetError, where reading on would end
     the process. Hence a process of its own.
     """
@@ -467,14 +480,9 @@ def test_places_beyond_the_arrays(files, tmp_path, name, value):
         f"transports/local/{name}",
         lambda array: np.full_like(array, value),
     )
-    program = (
-        f"import mi_prt\ntry:\n    mi_prt.load({str(path)!r})\nexcept mi_prt.AssetError:\n   "
-        " print('refused')"
-    )
-    run = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, timeout=60
-    )
-    assert (run.returncode, run.stdout.strip()) == (0, "refused"), run.stderr[-500:]
+    process = starter.start("load", str(path))
+    output, errors = process.communicate()
+    assert (process.returncode, output.strip()) == (0, "refused"), errors[-500:]
 
 
 # --- light ----------------------------------------------------------------------------------------
@@ -695,35 +703,29 @@ def test_interrupts_keep_what_was_computed(files, tmp_path, stage):
     ]
 
 
-PROGRAM = """
-import sys, time
-sys.path.insert(0, sys.argv[1])
-from test_meshless_asset import STORAGE, precompute
-def progress(stage, done, total, detail):
-    print(stage, done, total, sep=";", flush=True)
-    time.sleep(0.03)
-precompute(output=sys.argv[2], resume=True, progress=progress, **STORAGE["16 sparse"])
-"""
+def run_slowly(path):
+    """Goes on where a run was left. In a process of its own."""
+
+    def progress(stage, done, total, detail):
+        print(stage, done, total, sep=";", flush=True)
+        time.sleep(0.03)
+
+    precompute(output=path, resume=True, progress=progress, **STORAGE["16 sparse"])
 
 
-def test_a_killed_run_ends_in_the_same_file(files, tmp_path):
+def test_a_killed_run_ends_in_the_same_file(files, starter, tmp_path):
     """SIGKILL while clusters are traced: no file is there, and what the next run leaves is the same
     to the byte.
     """
     path = tmp_path / "a.prt"
-    process = subprocess.Popen(
-        [sys.executable, "-c", PROGRAM, os.path.dirname(__file__), str(path)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    process = starter.start("run_slowly", str(path))
     line = "start"
     while line and not line.startswith("clusters"):
         line = process.stdout.readline()
     assert line, process.communicate()[1][-2000:]
     time.sleep(0.07)
     process.send_signal(signal.SIGKILL)
-    process.communicate(timeout=60)
+    process.communicate()
     assert not path.exists() and (tmp_path / "a.prt.partial" / "run.json").exists()
     precompute(output=path, resume=True, **STORAGE["16 sparse"])
     assert path.read_bytes() == files["16 sparse"].read_bytes()

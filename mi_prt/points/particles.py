@@ -282,10 +282,11 @@ def _source_rays(scene, count, seed):
                 )
     # else some lanes would start from one source only
     random = np.random.default_rng(seed).permutation(count)
-    return [
-        mi.Float(np.concatenate([_rows(getattr(ray, name), n) for ray, n in rays])[random].ravel())
-        for name in ("o", "d")
-    ]
+    vectors = (
+        np.concatenate([_rows(getattr(ray, name), n) for ray, n in rays]) for name in ("o", "d")
+    )
+    # `take` of rows that lie together is several times as fast as an index
+    return [mi.Float(np.ascontiguousarray(v).take(random, axis=0).ravel()) for v in vectors]
 
 
 def _sends_rays(source):
