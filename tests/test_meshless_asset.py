@@ -735,7 +735,7 @@ def test_a_killed_run_ends_in_the_same_file(files, starter, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "points", [dict(points="samples", count=4000), dict(points="vertices", edge_length=0.05)]
+    "points", [dict(points="samples", count=3200), dict(points="vertices", edge_length=0.05)]
 )
 def test_the_cost_is_predicted_from_some_of_the_points(points):
     """A run with fewer points than there are, also where those are nodes of patches: what is left

@@ -5,6 +5,7 @@ gives the same file.
 import fcntl
 import json
 import os
+import shutil
 import signal
 import sys
 import time
@@ -200,10 +201,10 @@ def test_interrupts_keep_what_was_computed(files, tmp_path, monkeypatch, run, st
 # --- what may not be continued --------------------------------------------------------------------
 
 
-@pytest.fixture
-def unfinished(tmp_path):
+@pytest.fixture(scope="module")
+def interrupted(tmp_path_factory):
     """A run that was interrupted after all rays were traced."""
-    path = tmp_path / "asset.prt"
+    path = tmp_path_factory.mktemp("interrupted") / "asset.prt"
 
     def interrupt(stage, done, total, detail):
         if stage == "basis":
@@ -211,6 +212,14 @@ def unfinished(tmp_path):
 
     with pytest.raises(KeyboardInterrupt):
         mi_prt.precompute(SCENE, output=path, progress=interrupt, **SETTINGS)
+    return path
+
+
+@pytest.fixture
+def unfinished(interrupted, tmp_path):
+    """A copy of it, that a test may change."""
+    path = tmp_path / "asset.prt"
+    shutil.copytree(partial(interrupted), partial(path))
     return path
 
 
