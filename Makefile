@@ -11,7 +11,7 @@ JOBS   := 2
 help:
 	@echo 'make demo    render and relight the example scene'
 	@echo 'make check   format, lint and types'
-	@echo 'make test    run the tests (ARGS="-k name" passes options to pytest)'
+	@echo 'make test    run the tests (ARGS="-k name" passes options to pytest; -m "not slow" leaves out slow ones)'
 	@echo 'make clean   remove the Python environment; the next make sets it up again'
 
 demo: $(stamp)
@@ -22,7 +22,10 @@ check: $(stamp)
 	$(venv)/bin/ruff check .
 	$(venv)/bin/basedpyright --pythonpath $(python)
 
-# Two processes: Mitsuba and BLAS use all cores inside each, and what is left idle by one the other takes.
+# Two processes: Mitsuba uses all cores inside each, and what is left idle by one the other takes.
+# Compiled Python is kept, also where the environment asks for none: a hundred processes start here.
+test: export PYTHONDONTWRITEBYTECODE =
+test: export PYTHONPYCACHEPREFIX = $(CURDIR)/$(venv)/.pycache
 test: $(stamp)
 	$(python) -m pytest -q -n $(JOBS) --dist loadfile $(ARGS)
 

@@ -3,6 +3,7 @@
 Scenes are y-up, lengths in metres.
 """
 
+import gc
 import importlib
 from dataclasses import dataclass, replace
 
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 import scipy.stats
 from mutants import Parts
+from threadpoolctl import threadpool_limits
 
 from mi_prt.directions import parse_directions
 from mi_prt.points.points import sample_points
@@ -19,6 +21,16 @@ from mi_prt.transport.bits import find_buried, sample_direct
 from mi_prt.transport.hops import NOTHING, Hops, HopSampler, blocked_share
 from mi_prt.transport.interreflection import solve, split_by_bounces
 from mi_prt.transport.paths import PathSampler
+
+
+def pytest_collection_finish():
+    """What is there before the first test stays, and the collector need not look at it again.
+    Tests run in as many processes as there are cores: BLAS's own threads would wait in loops for
+    each other's cores, a fifth of all time.
+    """
+    gc.collect()
+    gc.freeze()
+    threadpool_limits(1, "blas")
 
 
 def facing(normal, position=(0, 0, 0), size=1.0):

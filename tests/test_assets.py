@@ -20,6 +20,8 @@ from mi_prt.render.image import render_image
 from mi_prt.scene.scene import open_scene
 from mi_prt.system.runtime import mitsuba
 
+pytestmark = pytest.mark.slow
+
 POINTS = {
     "vertices": {"points": "vertices", "edge_length": 0.25},
     "samples": {"points": "samples", "count": 3000},

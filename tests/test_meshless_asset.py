@@ -666,6 +666,7 @@ def test_too_little_memory_is_refused_before_the_work(tmp_path):
     assert stages <= {"samples"} and os.listdir(tmp_path) == [] and "\n" not in str(caught.value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stage", ["example lights", "importance", "clusters", "transfer"])
 def test_interrupts_keep_what_was_computed(files, tmp_path, stage):
     """Ctrl-C in each stage: no file; then the run goes on, clusters that are there are not traced
@@ -734,6 +735,7 @@ def test_a_killed_run_ends_in_the_same_file(files, starter, tmp_path):
 # --- forecasts ------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "points", [dict(points="samples", count=3200), dict(points="vertices", edge_length=0.05)]
 )

@@ -117,6 +117,7 @@ def starter():
         yield starter
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("run", "chain"), [("direct", 0), ("solve", 1), ("solve", 2), ("paths", 3), ("paths", 4)]
 )

@@ -369,5 +369,5 @@ class _Kept:
         """Hits from a row on, and all flights (k, 2, 3) from there on."""
         met = np.flatnonzero(np.array(self._met)[first:])
         columns = [np.array(column).reshape(self._rows, -1)[first:] for column in self._columns]
-        fields = [column[met] for column in columns[:6]]
+        fields = [column.take(met, axis=0) for column in columns[:6]]
         return Hits(*fields[:5], fields[5][:, 0].astype(np.int32)), np.stack(columns[6:], axis=1)  # pyright: ignore[reportCallIssue]
