@@ -11,7 +11,7 @@ JOBS   := 2
 help:
 	@echo 'make demo    render and relight the example scene'
 	@echo 'make check   format, lint and types'
-	@echo 'make test    run the tests (ARGS="-k name" passes options to pytest; -m "not slow" leaves out slow ones)'
+	@echo 'make test    run the tests (ARGS="-k name" passes options to pytest)'
 	@echo 'make clean   remove the Python environment; the next make sets it up again'
 
 demo: $(stamp)

@@ -3,6 +3,7 @@ was written, or a typed error.
 """
 
 import dataclasses
+import importlib
 import itertools
 import json
 import os
@@ -737,17 +738,19 @@ def test_a_killed_run_ends_in_the_same_file(files, starter, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "points", [dict(points="samples", count=3200), dict(points="vertices", edge_length=0.05)]
+    "points", [dict(points="samples", count=1600), dict(points="vertices", edge_length=0.08)]
 )
-def test_the_cost_is_predicted_from_some_of_the_points(points):
+def test_the_cost_is_predicted_from_some_of_the_points(monkeypatch, points):
     """A run with fewer points than there are, also where those are nodes of patches: what is left
     of them has no patches. The size of the file comes out within a factor of two.
     """
-    settings = SETTINGS | points | dict(transports="local", cluster_size=400)
+    pilot = importlib.import_module("mi_prt.precompute.local")
+    monkeypatch.setattr(pilot, "PROBE_POINTS", 1200)
+    settings = SETTINGS | points | dict(transports="local", cluster_size=160)
     if points["points"] == "vertices":
         del settings["count"]
     found = describe(SCENE, **settings)
-    assert found["requires"]["points"] > 3000  # more than the pilot takes
+    assert found["requires"]["points"] > 1.3 * pilot.PROBE_POINTS
     assert found["predicted"]["seconds"] > 0
     asset = mi_prt.precompute(SCENE, **settings)
     stored = sum(array.nbytes for array in local(asset).arrays().values())
