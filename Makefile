@@ -22,7 +22,10 @@ check: $(stamp)
 	$(venv)/bin/ruff check .
 	$(venv)/bin/basedpyright --pythonpath $(python)
 
-# Two processes: Mitsuba and BLAS use all cores inside each, and what is left idle by one the other takes.
+# Two processes: Mitsuba uses all cores inside each, and what is left idle by one the other takes.
+# Compiled Python is kept, also where the environment asks for none: a hundred processes start here.
+test: export PYTHONDONTWRITEBYTECODE =
+test: export PYTHONPYCACHEPREFIX = $(CURDIR)/$(venv)/.pycache
 test: $(stamp)
 	$(python) -m pytest -q -n $(JOBS) --dist loadfile $(ARGS)
 

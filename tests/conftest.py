@@ -3,11 +3,15 @@
 Scenes are y-up, lengths in metres.
 """
 
+import gc
+import importlib
 from dataclasses import dataclass, replace
 
 import numpy as np
+import pytest
 import scipy.stats
 from mutants import Parts
+from threadpoolctl import threadpool_limits
 
 from mi_prt.directions import parse_directions
 from mi_prt.points.points import sample_points
@@ -17,6 +21,16 @@ from mi_prt.transport.bits import find_buried, sample_direct
 from mi_prt.transport.hops import NOTHING, Hops, HopSampler, blocked_share
 from mi_prt.transport.interreflection import solve, split_by_bounces
 from mi_prt.transport.paths import PathSampler
+
+
+def pytest_collection_finish():
+    """What is there before the first test stays, and the collector need not look at it again.
+    Tests run in as many processes as there are cores: BLAS's own threads would wait in loops for
+    each other's cores, a fifth of all time.
+    """
+    gc.collect()
+    gc.freeze()
+    threadpool_limits(1, "blas")
 
 
 def facing(normal, position=(0, 0, 0), size=1.0):
@@ -276,6 +290,14 @@ def sampled(parts, edge_length, directions="cubemap:16", rays_per_direction=1):
     return SampledScene(
         opened, points, lattice, transport, blocked_share(transport, lattice.solid_angles)
     )
+
+
+@pytest.fixture
+def few_compared_points(monkeypatch):
+    """`compare` takes the truth at 512 points: with as many paths at each its bias and error are
+    told as well, where a test does not depend on their number.
+    """
+    monkeypatch.setattr(importlib.import_module("mi_prt.evaluate.compare"), "COMPARED_POINTS", 512)
 
 
 def distant(asset):

@@ -20,6 +20,8 @@ from mi_prt.render.image import render_image
 from mi_prt.scene.scene import open_scene
 from mi_prt.system.runtime import mitsuba
 
+pytestmark = pytest.mark.slow
+
 POINTS = {
     "vertices": {"points": "vertices", "edge_length": 0.25},
     "samples": {"points": "samples", "count": 3000},
@@ -134,7 +136,7 @@ def made(request):
 def truths(made):
     """Some points, and Mitsuba's direct and indirect irradiance there, by the light's name."""
     shown = np.flatnonzero(~made.asset.buried)
-    chosen = np.sort(np.random.default_rng(1).permutation(shown)[:200])
+    chosen = np.sort(np.random.default_rng(1).permutation(shown)[:100])
     points, found = made.asset.points.at(chosen), {}
     for name, light in LIGHTS.items():
         lit = lit_scene(made.scene, made.asset.resolved(light, scene=made.scene), modelled=True)

@@ -334,6 +334,7 @@ def at_altitude(degrees):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("altitude", [90, 89.5, 30, 5])
 def test_energy_of_a_sunsky(altitude):
     """Σ_j w_j L_j equals ∫ L dω of Mitsuba's emitter: the sun is whole wherever in the sky it

@@ -21,7 +21,10 @@ from mi_prt.errors import AssetError
 from mi_prt.system.schema import Array, ListOf, Number, OneOf, Record, Text, check
 
 FUZZER = Path(__file__).parent / "fuzz_assets.py"
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="limits and watches are Linux's")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(sys.platform != "linux", reason="limits and watches are Linux's"),
+]
 
 # --- a small asset that has what the real one has: indices, ranges, kinds, a recorded path --------
 

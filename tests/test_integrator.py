@@ -354,14 +354,10 @@ def test_materials_that_are_not_diffuse_show_their_diffuse_part(bounces):
         cube((-0.9, 0.4, 0.3), 0.4, bsdf=diffuse([0.7, 0.5, 0.3])),
     )
     expected = mi.load_dict(still_life(ball=black, post=painted))
+    reference = by_mitsuba(expected, bounces=bounces)
     for optimize in (False, True):
         lit = mi.load_dict(parts, optimize=optimize)
-        compared(
-            render(lit, integrator_for(asset)),
-            by_mitsuba(expected, bounces=bounces),
-            0.05,
-            mask=inner(lit),
-        )
+        compared(render(lit, integrator_for(asset)), reference, 0.05, mask=inner(lit))
 
 
 @pytest.mark.parametrize(

@@ -428,6 +428,7 @@ def test_white_surfaces_under_a_white_sky_vanish(layout, name):
     assert (once[made.kept, 0] / np.pi < 1 + 2e-3).all()
 
 
+@pytest.mark.slow
 @both
 def test_reflected_sky_against_mitsuba(layout):
     """Colours of a yard bleed under a coloured sky; Mitsuba's path tracer at 300 points."""
@@ -504,6 +505,7 @@ def measured():
     return result
 
 
+@pytest.mark.slow
 @both
 def test_moved_lights_against_mitsuba(measured, layout):
     """Eight lights that were no examples, at 150 points: shadow rays have the direct irradiance,

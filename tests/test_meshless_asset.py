@@ -3,17 +3,17 @@ was written, or a typed error.
 """
 
 import dataclasses
+import importlib
 import itertools
 import json
 import os
 import signal
-import subprocess
-import sys
 import time
 
 import numpy as np
 import pytest
 from conftest import arrays_of, cube, diffuse, rectangle, rewritten, scene, uniform_sky
+from forked import Starter
 
 import mi_prt
 from mi_prt import (
@@ -95,6 +95,12 @@ def files(assets, tmp_path_factory):
     for name, asset in assets.items():
         asset.save(paths[name])
     return paths
+
+
+@pytest.fixture(scope="module")
+def starter():
+    with Starter("test_meshless_asset") as starter:
+        yield starter
 
 
 def values_of(asset):
@@ -456,8 +462,16 @@ BEYOND = [
 ]
 
 
+def load(path):
+    """Loads a file that is to be refused. In a process of its own."""
+    try:
+        mi_prt.load(path)
+    except AssetError:
+        print("refused")
+
+
 @pytest.mark.parametrize(("name", "value"), BEYOND)
-def test_places_beyond_the_arrays(files, tmp_path, name, value):
+def test_places_beyond_the_arrays(files, starter, tmp_path, name, value):
     """Indices that point elsewhere, or all to one place: an AssetError, where reading on would end
     the process. Hence a process of its own.
     """
@@ -467,14 +481,9 @@ def test_places_beyond_the_arrays(files, tmp_path, name, value):
         f"transports/local/{name}",
         lambda array: np.full_like(array, value),
     )
-    program = (
-        f"import mi_prt\ntry:\n    mi_prt.load({str(path)!r})\nexcept mi_prt.AssetError:\n   "
-        " print('refused')"
-    )
-    run = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, timeout=60
-    )
-    assert (run.returncode, run.stdout.strip()) == (0, "refused"), run.stderr[-500:]
+    process = starter.start("load", str(path))
+    output, errors = process.communicate()
+    assert (process.returncode, output.strip()) == (0, "refused"), errors[-500:]
 
 
 # --- light ----------------------------------------------------------------------------------------
@@ -658,6 +667,7 @@ def test_too_little_memory_is_refused_before_the_work(tmp_path):
     assert stages <= {"samples"} and os.listdir(tmp_path) == [] and "\n" not in str(caught.value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stage", ["example lights", "importance", "clusters", "transfer"])
 def test_interrupts_keep_what_was_computed(files, tmp_path, stage):
     """Ctrl-C in each stage: no file; then the run goes on, clusters that are there are not traced
@@ -695,35 +705,29 @@ def test_interrupts_keep_what_was_computed(files, tmp_path, stage):
     ]
 
 
-PROGRAM = """
-import sys, time
-sys.path.insert(0, sys.argv[1])
-from test_meshless_asset import STORAGE, precompute
-def progress(stage, done, total, detail):
-    print(stage, done, total, sep=";", flush=True)
-    time.sleep(0.03)
-precompute(output=sys.argv[2], resume=True, progress=progress, **STORAGE["16 sparse"])
-"""
+def run_slowly(path):
+    """Goes on where a run was left. In a process of its own."""
+
+    def progress(stage, done, total, detail):
+        print(stage, done, total, sep=";", flush=True)
+        time.sleep(0.03)
+
+    precompute(output=path, resume=True, progress=progress, **STORAGE["16 sparse"])
 
 
-def test_a_killed_run_ends_in_the_same_file(files, tmp_path):
+def test_a_killed_run_ends_in_the_same_file(files, starter, tmp_path):
     """SIGKILL while clusters are traced: no file is there, and what the next run leaves is the same
     to the byte.
     """
     path = tmp_path / "a.prt"
-    process = subprocess.Popen(
-        [sys.executable, "-c", PROGRAM, os.path.dirname(__file__), str(path)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    process = starter.start("run_slowly", str(path))
     line = "start"
     while line and not line.startswith("clusters"):
         line = process.stdout.readline()
     assert line, process.communicate()[1][-2000:]
     time.sleep(0.07)
     process.send_signal(signal.SIGKILL)
-    process.communicate(timeout=60)
+    process.communicate()
     assert not path.exists() and (tmp_path / "a.prt.partial" / "run.json").exists()
     precompute(output=path, resume=True, **STORAGE["16 sparse"])
     assert path.read_bytes() == files["16 sparse"].read_bytes()
@@ -732,18 +736,21 @@ def test_a_killed_run_ends_in_the_same_file(files, tmp_path):
 # --- forecasts ------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    "points", [dict(points="samples", count=4000), dict(points="vertices", edge_length=0.05)]
+    "points", [dict(points="samples", count=1600), dict(points="vertices", edge_length=0.08)]
 )
-def test_the_cost_is_predicted_from_some_of_the_points(points):
+def test_the_cost_is_predicted_from_some_of_the_points(monkeypatch, points):
     """A run with fewer points than there are, also where those are nodes of patches: what is left
     of them has no patches. The size of the file comes out within a factor of two.
     """
-    settings = SETTINGS | points | dict(transports="local", cluster_size=400)
+    pilot = importlib.import_module("mi_prt.precompute.local")
+    monkeypatch.setattr(pilot, "PROBE_POINTS", 1200)
+    settings = SETTINGS | points | dict(transports="local", cluster_size=160)
     if points["points"] == "vertices":
         del settings["count"]
     found = describe(SCENE, **settings)
-    assert found["requires"]["points"] > 3000  # more than the pilot takes
+    assert found["requires"]["points"] > 1.3 * pilot.PROBE_POINTS
     assert found["predicted"]["seconds"] > 0
     asset = mi_prt.precompute(SCENE, **settings)
     stored = sum(array.nbytes for array in local(asset).arrays().values())

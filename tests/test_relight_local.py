@@ -103,14 +103,18 @@ def truth(opened, light, spp=1024, depth=-1):
     return ground_truth.image(lit, lit.sensors()[0], spp, max_depth=depth).mean
 
 
+@pytest.fixture(scope="module")
+def expected(opened):
+    return truth(opened, LIGHT)
+
+
 @pytest.mark.parametrize("direct, limit", [("points", 0.12), ("pixels", 0.06)])
-def test_images_are_those_of_the_path_tracer(asset, opened, tmp_path, direct, limit):
+def test_images_are_those_of_the_path_tracer(asset, expected, tmp_path, direct, limit):
     """Of all pixels, against 1,024 samples (noise about 2 %).
 
     Direct light at pixels has no shadow that points would have to show.
     """
     relight_to_file(asset, tmp_path / "a.exr", LIGHT, scene=room(), direct=direct, spp=64)
-    expected = truth(opened, LIGHT)
     found = image(tmp_path / "a.exr")
     assert relative_l2(found, expected) < limit
     assert abs(bias(found, expected)) < 0.03
@@ -211,7 +215,7 @@ def test_plugin_follows_the_scenes_own_lamps(asset):
         parameters.update()
 
 
-def test_comparison_tells_components(asset, tmp_path):
+def test_comparison_tells_components(asset, few_compared_points, tmp_path):
     report = mi_prt.compare(asset, tmp_path / "r", LIGHT, scene=room(), spp=64)
     assert set(report["components"]) == {"direct", "indirect"}
     assert report["points"]["relative_rmse_beyond_noise"] < 0.12
@@ -358,7 +362,7 @@ def run(capsys, *arguments):
     return end.value.code, out.out, out.err
 
 
-def test_command_line(from_file, tmp_path, capsys):
+def test_command_line(from_file, few_compared_points, tmp_path, capsys):
     code, out, _ = run(
         capsys,
         "relight",

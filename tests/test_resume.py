@@ -5,14 +5,15 @@ gives the same file.
 import fcntl
 import json
 import os
+import shutil
 import signal
-import subprocess
 import sys
 import time
 
 import numpy as np
 import pytest
 from conftest import cube, diffuse, disk, distant, rectangle, scene
+from forked import Starter
 
 import mi_prt
 import mi_prt.system.runtime
@@ -21,7 +22,7 @@ from mi_prt.basis import pca
 from mi_prt.precompute import budget as room
 from mi_prt.precompute.workspace import RowFile, durable, temporary
 from mi_prt.system.memory import resident_bytes
-from mi_prt.system.runtime import mitsuba
+from mi_prt.system.runtime import mitsuba, peak_memory_bytes
 from mi_prt.system.runtime import thread_count as mitsuba_threads
 from mi_prt.transport.interreflection import MOST_SUMMED_BOUNCES
 
@@ -96,36 +97,31 @@ def partial(path):
 
 # --- SIGKILL --------------------------------------------------------------------------------------
 
-PROGRAM = """
-import sys, time
-sys.path.insert(0, sys.argv[1])
-import mi_prt
-from mi_prt.precompute import budget as room
-from mi_prt.basis import pca
-from test_resume import LANES, RUNS, SCENE
-pca.NEGLIGIBLE = 0
-room.LANES = LANES
-def progress(stage, done, total, detail):
-    print(stage, done, total, flush=True)
-    time.sleep(0.002)  # moments between the writes, in which a signal may arrive as well
-mi_prt.precompute(SCENE, output=sys.argv[2], resume=True, progress=progress, **RUNS[sys.argv[3]])
-"""
+
+def run_slowly(path, run):
+    """Goes on where a run was left, with moments between the writes, in which a signal may arrive
+    as well. In a process of its own.
+    """
+    pca.NEGLIGIBLE, room.LANES = 0, LANES
+
+    def progress(stage, done, total, detail):
+        print(stage, done, total, flush=True)
+        time.sleep(0.002)
+
+    mi_prt.precompute(SCENE, output=path, resume=True, progress=progress, **RUNS[run])
 
 
-def start(path, run):
-    here = os.path.dirname(__file__)
-    return subprocess.Popen(
-        [sys.executable, "-c", PROGRAM, here, str(path), run],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+@pytest.fixture(scope="module")
+def starter():
+    with Starter("test_resume") as starter:
+        yield starter
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("run", "chain"), [("direct", 0), ("solve", 1), ("solve", 2), ("paths", 3), ("paths", 4)]
 )
-def test_killed_runs_end_in_the_same_file(files, tmp_path, run, chain):
+def test_killed_runs_end_in_the_same_file(files, starter, tmp_path, run, chain):
     """Four SIGKILLs in a row at random moments, 20 in all five cases, the last two of each while
     reflections are computed, if there are any; then the run is left alone.
 
@@ -135,7 +131,7 @@ def test_killed_runs_end_in_the_same_file(files, tmp_path, run, chain):
     undisturbed = files[run]
     rng, path, reached, killed = np.random.default_rng(chain), tmp_path / "asset.prt", {}, 0
     while killed < 4:
-        process = start(path, run)
+        process = starter.start("run_slowly", str(path), run)
         lines = [process.stdout.readline()]
         assert lines[0], process.communicate()[1][-2000:]
         while (
@@ -144,7 +140,7 @@ def test_killed_runs_end_in_the_same_file(files, tmp_path, run, chain):
             lines.append(process.stdout.readline())
         time.sleep(rng.uniform(0, 0.4))
         process.send_signal(signal.SIGKILL)
-        output, _ = process.communicate(timeout=60)
+        output, _ = process.communicate()
         killed += process.returncode == -signal.SIGKILL
         for stage in ("transport", "indirect"):
             done = [
@@ -159,7 +155,7 @@ def test_killed_runs_end_in_the_same_file(files, tmp_path, run, chain):
             assert path.read_bytes() == undisturbed.read_bytes()
             path.unlink()
             reached = reached if (partial(path) / "run.json").exists() else {}
-    last = start(path, run)
+    last = starter.start("run_slowly", str(path), run)
     output, errors = last.communicate(timeout=120)
     assert last.returncode == 0, errors[-2000:]
     assert path.read_bytes() == undisturbed.read_bytes()
@@ -206,10 +202,10 @@ def test_interrupts_keep_what_was_computed(files, tmp_path, monkeypatch, run, st
 # --- what may not be continued --------------------------------------------------------------------
 
 
-@pytest.fixture
-def unfinished(tmp_path):
+@pytest.fixture(scope="module")
+def interrupted(tmp_path_factory):
     """A run that was interrupted after all rays were traced."""
-    path = tmp_path / "asset.prt"
+    path = tmp_path_factory.mktemp("interrupted") / "asset.prt"
 
     def interrupt(stage, done, total, detail):
         if stage == "basis":
@@ -217,6 +213,14 @@ def unfinished(tmp_path):
 
     with pytest.raises(KeyboardInterrupt):
         mi_prt.precompute(SCENE, output=path, progress=interrupt, **SETTINGS)
+    return path
+
+
+@pytest.fixture
+def unfinished(interrupted, tmp_path):
+    """A copy of it, that a test may change."""
+    path = tmp_path / "asset.prt"
+    shutil.copytree(partial(interrupted), partial(path))
     return path
 
 
@@ -661,38 +665,34 @@ def test_too_little_memory_says_how_much_is_needed():
         mi_prt.precompute(SCENE, max_memory="10M", **SETTINGS)
 
 
-@pytest.mark.parametrize("run", RUNS)
-def test_a_run_stays_within_its_memory_and_gives_the_same_file(files, tmp_path, run):
-    """The peak of a fresh process, by the kernel's own count, with a limit that a whole wavefront
-    does not fit into.
+def run_within_memory(path, run):
+    """Prints a limit, the peak below it, and blocks with it and without. In a process of its
+    own.
     """
-    code = """
-import sys; sys.path.insert(0, sys.argv[1])
-import mi_prt
-from mi_prt.basis import pca
-from mi_prt.system.memory import resident_bytes
-from mi_prt.system.runtime import mitsuba, peak_memory_bytes
-from mi_prt.scene.scene import open_scene
-from test_resume import RUNS, SCENE
-pca.NEGLIGIBLE = 0
-settings = RUNS[sys.argv[3]]
-small = dict(directions="cubemap:2", edge_length=1, coefficients=4)
-mi_prt.precompute(SCENE, **settings | small)  # what Mitsuba and Embree take once
-limit = resident_bytes() + 60_000_000
-def blocks(**options):
-    stages = []
-    mi_prt.precompute(SCENE, progress=lambda stage, *_: stages.append(stage), **options, **settings)
-    return stages.count("transport")
-limited = blocks(output=sys.argv[2], max_memory=limit)
-print(limit, peak_memory_bytes(), limited, blocks())
-"""
-    ran = subprocess.run(
-        [sys.executable, "-c", code, os.path.dirname(__file__), str(tmp_path / "a.prt"), run],
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-    assert ran.returncode == 0, ran.stderr[-2000:]
-    limit, peak, limited, blocks = map(int, ran.stdout.split())
+    pca.NEGLIGIBLE, settings = 0, RUNS[run]
+    small = dict(directions="cubemap:2", edge_length=1, coefficients=4)
+    mi_prt.precompute(SCENE, **settings | small)  # what Mitsuba and Embree take once
+    limit = resident_bytes() + 60_000_000
+
+    def blocks(**options):
+        stages = []
+        mi_prt.precompute(
+            SCENE, progress=lambda stage, *_: stages.append(stage), **options, **settings
+        )
+        return stages.count("transport")
+
+    limited = blocks(output=path, max_memory=limit)
+    print(limit, peak_memory_bytes(), limited, blocks())
+
+
+@pytest.mark.parametrize("run", RUNS)
+def test_a_run_stays_within_its_memory_and_gives_the_same_file(files, starter, tmp_path, run):
+    """The peak of a process that ran nothing before, by the kernel's own count, with a limit that a
+    whole wavefront does not fit into.
+    """
+    process = starter.start("run_within_memory", str(tmp_path / "a.prt"), run)
+    output, errors = process.communicate(timeout=120)
+    assert process.returncode == 0, errors[-2000:]
+    limit, peak, limited, blocks = map(int, output.split())
     assert peak <= limit and limited > blocks
     assert (tmp_path / "a.prt").read_bytes() == files[run].read_bytes()

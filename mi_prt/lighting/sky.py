@@ -4,7 +4,7 @@ import numpy as np
 
 from ..system.runtime import mitsuba
 from .environment import EnvironmentMap
-from .summed import pixel_directions
+from .summed import column_factors, directions_of, pixel_directions, row_factors
 
 BAKED_HEIGHT = 512  # rows of the map that an analytic sky is baked to
 SKY_SAMPLES = 8  # samples of every pixel
@@ -63,10 +63,8 @@ def _pixel_means(emitter, pixels, height, samples):
     offsets = 2 * np.stack([place / samples, place * (5**0.5 - 1) / 2 % 1], axis=-1) - 1
     sums, weights, largest = 0.0, 0.0, 0.0
     for chunk in np.array_split(offsets, max(1, len(pixels) * len(offsets) >> 20)):
-        rows = pixels[:, None, 0] + chunk[None, :, 0]
-        columns = pixels[:, None, 1] + chunk[None, :, 1]
-        directions = pixel_directions(rows, columns, height, 2 * height)
-        radiance = evaluate(emitter, directions.reshape(-1, 3)).reshape(*rows.shape, 3)
+        directions = _directions_in(pixels, chunk, height)
+        radiance = evaluate(emitter, directions.reshape(-1, 3)).reshape(directions.shape)
         sine = np.hypot(directions[..., 0], directions[..., 2])
         weight = sine * (1 - np.abs(chunk)).prod(axis=1)
         sums = sums + (radiance * weight[..., None]).sum(axis=1)
@@ -74,6 +72,18 @@ def _pixel_means(emitter, pixels, height, samples):
         largest = np.maximum(largest, radiance.max(axis=(1, 2)))
     means = sums / np.maximum(weights, 1e-12)
     return means, (largest / np.maximum(means.max(axis=1), 1e-12))[:, None]
+
+
+def _directions_in(pixels, offsets, height):
+    """Directions (k, o, 3) of places in pixels (k, 2); for many pixels from factors of each row and
+    column.
+    """
+    if len(pixels) < 4 * height:
+        places = pixels[:, None] + offsets
+        return pixel_directions(places[..., 0], places[..., 1], height, 2 * height)
+    rows = row_factors(np.arange(height)[:, None] + offsets[:, 0], height)
+    columns = column_factors(np.arange(2 * height)[:, None] + offsets[:, 1], 2 * height)
+    return directions_of(*(x[pixels[:, 0]] for x in rows), *(x[pixels[:, 1]] for x in columns))
 
 
 def _pixel_of(directions, height):

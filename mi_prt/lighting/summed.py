@@ -65,7 +65,21 @@ def pixel_directions(rows, columns, height, width):
     """Directions (…, 3) in which a map of a size shows some of its pixels, or places between them,
     in its own frame.
     """
+    return directions_of(*row_factors(rows, height), *column_factors(columns, width))
+
+
+def row_factors(rows, height):
+    """Sine and cosine of the angle that rows of a map are from its pole."""
     theta = rows * (np.pi / (height - 1))
+    return np.maximum(np.sin(theta), 0), np.cos(theta)  # beyond the poles there is nothing
+
+
+def column_factors(columns, width):
+    """Sine and cosine of the angle that columns of a map are around its pole."""
     phi = (columns + 0.5) * (2 * np.pi / width)
-    sine = np.maximum(np.sin(theta), 0)  # beyond the poles there is nothing
-    return np.stack([np.sin(phi) * sine, np.cos(theta), -np.cos(phi) * sine], axis=-1)
+    return np.sin(phi), np.cos(phi)
+
+
+def directions_of(sine, cosine, across, along):
+    """Directions (…, 3) of factors of rows and of columns."""
+    return np.stack([across * sine, cosine, -along * sine], axis=-1)

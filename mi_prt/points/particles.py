@@ -282,10 +282,11 @@ def _source_rays(scene, count, seed):
                 )
     # else some lanes would start from one source only
     random = np.random.default_rng(seed).permutation(count)
-    return [
-        mi.Float(np.concatenate([_rows(getattr(ray, name), n) for ray, n in rays])[random].ravel())
-        for name in ("o", "d")
-    ]
+    vectors = (
+        np.concatenate([_rows(getattr(ray, name), n) for ray, n in rays]) for name in ("o", "d")
+    )
+    # `take` of rows that lie together is several times as fast as an index
+    return [mi.Float(np.ascontiguousarray(v).take(random, axis=0).ravel()) for v in vectors]
 
 
 def _sends_rays(source):
@@ -368,5 +369,5 @@ class _Kept:
         """Hits from a row on, and all flights (k, 2, 3) from there on."""
         met = np.flatnonzero(np.array(self._met)[first:])
         columns = [np.array(column).reshape(self._rows, -1)[first:] for column in self._columns]
-        fields = [column[met] for column in columns[:6]]
+        fields = [column.take(met, axis=0) for column in columns[:6]]
         return Hits(*fields[:5], fields[5][:, 0].astype(np.int32)), np.stack(columns[6:], axis=1)  # pyright: ignore[reportCallIssue]

@@ -17,6 +17,7 @@ _GROW = 1.06  # of a radius that is too small
 _MARGIN = 1.06  # of the first radius over the one that is expected to be right
 _PILOT = 8192  # candidates that the radius is first told from
 _BATCH = 512  # candidates that are tried first
+_MANY = 8192  # candidates that are looked at in several threads
 
 
 def embedded(positions, normals, radius):
@@ -111,7 +112,10 @@ def _add(points, order, chosen, radius, most=None):
         first, size = first + size, 2 * size
         if len(chosen):
             distance, _ = cKDTree(points[chosen]).query(
-                points[batch], distance_upper_bound=max(radius, 1e-300), workers=-1
+                points[batch],
+                distance_upper_bound=max(radius, 1e-300),
+                # SciPy starts threads in every call, which takes longer than a small one
+                workers=-1 if len(batch) >= _MANY else 1,
             )
             batch = batch[distance >= radius]
         new = batch[_keep_distance(points[batch], radius)]
