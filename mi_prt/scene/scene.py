@@ -12,6 +12,9 @@ import numpy as np
 
 from ..errors import SceneError
 from ..system.runtime import a_worker_at_least, mitsuba
+from .bounds import bounds_of
+from .interactions import make_interactions
+from .mesh import mesh_arrays
 from .own_lights import list_own_lights
 from .rebuild import check_can_be_copied, kept_parts, rebuilt_scene
 from .surface import list_surfaces
@@ -86,6 +89,11 @@ class Scene:
         return tuple(own.emitter for own in self.own_lights if not own.is_distant)
 
     @cached_property
+    def bounds(self):
+        """See `bounds_of`."""
+        return bounds_of(self.mi_scene)
+
+    @cached_property
     def scale(self):
         """See `scale_of`."""
         return scale_of(self.mi_scene)
@@ -98,6 +106,16 @@ class Scene:
         through shared edges.
         """
         return rebuilt_scene([c for _, c in self._children if isinstance(c, mitsuba().Shape)])
+
+    @cached_property
+    def interaction(self):
+        """Surface interactions of hits in it, see `make_interactions`."""
+        return make_interactions(self.surfaces)
+
+    def intersect(self, ray, active=True):
+        """The surface interactions (mi.SurfaceInteraction3f) of rays, watertight."""
+        pi = self.occluders.ray_intersect_preliminary(ray, active=active)
+        return self.interaction(pi, ray, active)
 
     @cached_property
     def hash(self):
@@ -244,42 +262,10 @@ def scale_of(mi_scene):
     Raises
     ------
     SceneError
-        If the bounding box is not finite.
+        If it is not finite, see `bounds_of`.
     """
-    box = mi_scene.bbox()
-    low, high = (
-        np.array(box.min, dtype=np.float64).ravel(),
-        np.array(box.max, dtype=np.float64).ravel(),
-    )
-    if not np.isfinite([low, high]).all():
-        raise SceneError(
-            f"the scene's bounding box {low}…{high} is not finite: a mesh holds NaN or infinite"
-            " positions"
-        )
+    low, high = bounds_of(mi_scene)
     return float(max(np.linalg.norm(high - low), np.abs([low, high]).max()))
-
-
-def mesh_arrays(mesh):
-    """Buffers of a mesh in its own frame.
-
-    Returns
-    -------
-    positions : (v, 3) float32
-    faces : (f, 3) int64
-    normals : (v, 3) float32 or None
-        Shading normals as Mitsuba uses them (flip_normals applied); None if the mesh is faceted.
-    uv : (v, 2) float32 or None
-    """
-    positions = np.array(mesh.vertex_positions_buffer(), dtype=np.float32).reshape(-1, 3)
-    faces = np.array(mesh.faces_buffer(), dtype=np.int64).reshape(-1, 3)
-    normals = uv = None
-    if mesh.has_vertex_normals() and not mesh.has_face_normals():
-        normals = np.array(mesh.vertex_normals_buffer(), dtype=np.float32).reshape(-1, 3)
-        if mesh.has_flipped_normals():
-            normals = -normals
-    if mesh.has_vertex_texcoords():
-        uv = np.array(mesh.vertex_texcoords_buffer(), dtype=np.float32).reshape(-1, 2)
-    return positions, faces, normals, uv
 
 
 def _holds_objects(content):

@@ -178,7 +178,7 @@ def find_buried(scene, points, dark=None, lanes=LANES):
         toward *= np.where(np.sum(toward * normals, axis=1) < 0, -1, 1)[:, None].astype(np.float32)
         origins = points.at(chunk).ray_origins(RAY_OFFSET * scene.scale)
         ray = mi.Ray3f(mi.Point3f(np.repeat(origins, BURIED_RAYS, axis=0).T), mi.Vector3f(toward.T))
-        hit = scene.occluders.ray_intersect(ray)
+        hit = scene.intersect(ray)
         inside = hit.is_valid() & ((dr.dot(hit.n, ray.d) > 0) | (hit.t < 1e-3 * scene.scale))
         buried[chunk] = np.array(inside).reshape(len(chunk), BURIED_RAYS).all(axis=1)
     return buried
