@@ -52,8 +52,8 @@ def left_out(scene, points, transports):
     Returns
     -------
     list of dict
-        what, shapes (names), share (part of the light at 45° that those materials scatter in the
-        way that is left out; None where it cannot be found out).
+        what, shapes (names), share (part of the light at 45° that those materials scatter beyond
+        their models, below 0 where they scatter less; None where it cannot be found out).
     """
     by_material = {}
     for surface in scene.surfaces:

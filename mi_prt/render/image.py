@@ -85,9 +85,16 @@ def resized(sensor, size):
     Raises
     ------
     SettingsError
-        If a side is below 1 or the image would have more than 67 million pixels.
+        If a side is below 1, here or of the film, or the image would have more than 67 million
+        pixels.
     """
     if size is None:
+        width, height = sensor.film().crop_size()
+        if min(width, height) < 1:
+            raise SettingsError(
+                f"the sensor's film has {width}x{height} pixels: give it a width and a height of at"
+                " least 1, or an image size (--size WxH)"
+            )
         yield sensor
         return
     width, height = size

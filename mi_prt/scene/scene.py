@@ -73,9 +73,6 @@ class Scene:
         self.surfaces = tuple(list_surfaces(mi_scene))
         if not self.surfaces:
             raise SceneError("the scene holds no shapes: there is nothing to light")
-        empty = [s.name for s in self.surfaces if s.kind == "mesh" and s.shape.face_count() == 0]
-        if empty:  # Dr.Jit cannot read from arrays without entries
-            raise SceneError(f"the mesh '{empty[0]}' has no faces: remove it from the scene")
         self.own_lights = list_own_lights(mi_scene)
 
     @property

@@ -78,7 +78,7 @@ def list_surfaces(mi_scene):
     groups = _groups(mi_scene)
     instances = [shape for shape in mi_scene.shapes() if _is_instance(shape)]
     group_of = dict(zip(instances, _groups_of(instances, list(groups))))
-    models = {}
+    models, checked = {}, set()
 
     def material(shape, name):
         bsdf = shape.bsdf()
@@ -94,6 +94,9 @@ def list_surfaces(mi_scene):
     def surface(name, shape, instance, to_world):
         found = Surface(name, shape, instance, to_world, material(shape, name))
         _check_extent(found)
+        if shape not in checked and found.kind == "mesh":
+            _check_faces(found)
+        checked.add(shape)
         return found
 
     for i, shape in enumerate(mi_scene.shapes()):
@@ -144,6 +147,20 @@ def _groups_of(instances, groups):
     return [next(group for mark, group in marks.items() if mark in text) for text in printed]
 
 
+def _check_faces(surface):
+    """Raise SceneError for a mesh whose faces name vertices that it does not have."""
+    mesh = surface.shape
+    count = mesh.vertex_count()
+    if not mesh.face_count():
+        raise SceneError(f"the mesh '{surface.name}' has no faces: remove it from the scene")
+    largest = int(np.array(mesh.faces_buffer()).max())
+    if largest >= count:
+        raise SceneError(
+            f"the mesh '{surface.name}' has a face with vertex {largest}, and only the {count:,}"
+            f" vertices 0…{count - 1}: repair its file"
+        )
+
+
 def _check_extent(surface):
     """Raise SceneError for a transform that leaves a shape no extent in some direction."""
     own = surface.shape_to_world
@@ -153,9 +170,9 @@ def _check_extent(surface):
         extents = np.linalg.svd(placed[:3, :3], compute_uv=False)
     if not extents[2] > _FLATTEST * extents[0]:
         raise SceneError(
-            f"the shape '{surface.name}' ({surface.shape.class_name()}) has a size of"
-            f" {extents[2]:g} in some direction beside {extents[0]:g} in another, or none that is"
-            " finite (its radius, its scale, or its to_world): give it an extent, or remove it"
+            f"the shape '{surface.name}' ({surface.shape.class_name()}) has no extent in some"
+            f" direction ({extents[2]:g} beside {extents[0]:g} in another: is a radius or a scale"
+            " 0, or a to_world not finite?): give it one, or remove it"
         )
 
 
