@@ -35,8 +35,8 @@ def scene_light(scene):
     distant = [own for own in scene.own_lights if own.is_distant]
     if not distant:
         raise LightError(
-            "the scene has no distant light (envmap, constant, sunsky, directional): pass one, such"
-            " as --envmap sky.exr or --light directional:…; for its own lamps precompute it with"
+            "the scene has no distant light (envmap, constant, sunsky, directional): pass a light,"
+            " such as --envmap sky.exr or --light directional:…; for its own lamps precompute it with"
             " --transports own"
         )
     return Light(tuple(map(distant_part, distant)))

@@ -1,8 +1,12 @@
 """The box around a scene."""
 
+import warnings
+
 import numpy as np
 
 from ..errors import SceneError
+
+FAR = 1000  # extents of a scene from the origin, from which on it is blurred
 
 
 def bounds_of(mi_scene):
@@ -40,3 +44,19 @@ def box_of(shape):
             " has positions that are NaN or infinite; repair it first"
         )
     return box
+
+
+def warn_if_far(mi_scene):
+    """Warn of a scene so far from the origin that single precision blurs it, in Mitsuba too."""
+    low, high = box = _box(mi_scene)
+    if not np.isfinite(box).all():
+        return  # told later, by the shape
+    extent, farthest = np.linalg.norm(high - low), np.abs(box).max()
+    if farthest > FAR * extent > 0:
+        step = np.spacing(np.float32(farthest))
+        warnings.warn(
+            f"the scene of {extent:.3g} m lies {farthest:.3g} m from the origin, where single"
+            f" precision places things to {step:.2g} m: Mitsuba's own pictures of it are damaged,"
+            " and so is what is computed here; move it to the origin",
+            stacklevel=3,
+        )

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..errors import SceneError
 from ..system.runtime import a_worker_at_least, mitsuba
-from .bounds import bounds_of
+from .bounds import bounds_of, warn_if_far
 from .interactions import make_interactions
 from .mesh import mesh_arrays
 from .own_lights import list_own_lights
@@ -249,6 +249,7 @@ def _loaded(what, load, *arguments, **parameters):
         raise SceneError(f"Mitsuba rejects {what}: {' '.join(str(error).split())}") from None
     if not isinstance(scene, mitsuba().Scene):
         raise SceneError(f"{what} is a {type(scene).__name__}, not a scene")
+    warn_if_far(scene)
     return scene
 
 
