@@ -36,8 +36,8 @@ def scene_light(scene):
     if not distant:
         raise LightError(
             "the scene has no distant light (envmap, constant, sunsky, directional): pass a light,"
-            " such as --envmap sky.exr or --light directional:…; for its own lamps precompute it with"
-            " --transports own"
+            " such as --envmap sky.exr or --light directional:…; for its own lamps precompute it"
+            " with --transports own"
         )
     return Light(tuple(map(distant_part, distant)))
 
