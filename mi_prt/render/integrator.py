@@ -125,7 +125,8 @@ def _plugin_class(variant):
             self._light = light
 
         def _warn_of_paint(self, opened):
-            if is_repainted(self.asset, opened):
+            # Whoever gives the irradiance has opened the scene, and been told.
+            if self._follows_emitters and is_repainted(self.asset, opened):
                 warnings.warn(REPAINTED, LightWarning, stacklevel=4)
 
         def sample(self, scene, sampler, ray, medium=None, active=True):

@@ -168,7 +168,7 @@ class _Meshes:
 
 def _joined(arrays, dtype):
     """One flat array; a few zeros where there are none, which Dr.Jit can gather from."""
-    return np.concatenate([x.ravel() for x in arrays]).astype(dtype) if arrays else np.zeros(3)
+    return np.concatenate([x.ravel() for x in arrays] or [np.zeros(6)]).astype(dtype)
 
 
 def _placed(surface):

@@ -111,7 +111,7 @@ class Scene:
 
     def intersect(self, ray, active=True):
         """The surface interactions (mi.SurfaceInteraction3f) of rays, watertight."""
-        pi = self.occluders.ray_intersect_preliminary(ray, active=active)
+        pi = self.occluders.ray_intersect_preliminary(ray, coherent=True, active=active)
         return self.interaction(pi, ray, active)
 
     @cached_property
