@@ -283,6 +283,7 @@ def test_a_group_named_with_quotes_is_opened():
     assert len(open_scene(case("forest_quote")).surfaces) == 7
 
 
+@pytest.mark.filterwarnings("ignore:the scene of 11.4 m")
 @pytest.mark.parametrize("name", ["forest40", "forest_two", "window_open", "far_utm"])
 def test_interactions_from_the_table_are_mitsubas(name, monkeypatch):
     """All that materials and points ask of a hit, in float32 (positions far off are coarser)."""
