@@ -673,9 +673,9 @@ def test_exr_without_a_channel_names_it(tmp_path):
     write_exr(tmp_path / "rg.exr", {"R": plane, "G": plane})
     with pytest.raises(LightError, match="lacks B"):
         EnvironmentMap(tmp_path / "rg.exr")
-    write_exr(tmp_path / "y.exr", {"Y": plane})
+    write_exr(tmp_path / "depth.exr", {"Z": plane})
     with pytest.raises(LightError, match="lacks R, G, B"):
-        EnvironmentMap(tmp_path / "y.exr")
+        EnvironmentMap(tmp_path / "depth.exr")
 
 
 def test_files_that_cannot_be_read(tmp_path):

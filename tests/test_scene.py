@@ -289,7 +289,7 @@ def test_materials(name):
     for word, entry in zip(
         words, sorted(entries, key=lambda e: [w in e["what"] for w in words].index(True))
     ):
-        assert word in entry["what"] and entry["shapes"] == ["thing"] and 0 <= entry["share"] <= 1
+        assert word in entry["what"] and entry["shapes"] == ["thing"] and -1 <= entry["share"] <= 1
 
 
 def test_the_share_that_is_left_out_is_that_of_the_light():

@@ -124,9 +124,15 @@ class Asset:
     def _holds_none(self, names):
         return LightError(
             f"of the scene's own lights ({', '.join(names)}) this asset, with transports"
-            f" {','.join(self.transports)}, holds none: pass a light (--light), or precompute it"
-            " with other transports (--transports)"
+            f" {','.join(self.transports)}, holds none: pass a light, such as --envmap sky.exr or"
+            f" --light scene:{next(iter(names))}, or precompute it with --transports"
+            f" {','.join([*self.transports, *self._lacking()])}"
         )
+
+    def _lacking(self):
+        """Kinds of transport that the scene's own lights ask for, and that are not there."""
+        kinds = {"distant" if emitter["distant"] else "own" for emitter in self.emitters}
+        return sorted(kinds - set(self.transports))
 
     def as_baked(self, scene):
         """Light of the emitters of a scene as they are now, as far as the asset holds it.

@@ -10,6 +10,11 @@ from ..errors import SceneError
 from ..lighting.environment import LightWarning
 from ..scene.scene import Scene, open_scene
 
+REPAINTED = (
+    "the scene's materials changed since it was precomputed: light that they reflect onto other"
+    " surfaces is still that of the old ones"
+)
+
 
 def describe_scene(scene, points, transports):
     """What an asset records of its scene: kind, path, is_relative (whether files keep the path
@@ -47,8 +52,8 @@ def left_out(scene, points, transports):
     Returns
     -------
     list of dict
-        what, shapes (names), share (part of the light at 45° that those materials scatter in the
-        way that is left out; None where it cannot be found out).
+        what, shapes (names), share (part of the light at 45° that those materials scatter beyond
+        their models, below 0 where they scatter less; None where it cannot be found out).
     """
     by_material = {}
     for surface in scene.surfaces:
@@ -123,12 +128,7 @@ def open_scene_of(asset, scene=None, parameters=None):
             " was precomputed; precompute it again, or pass the right one (--scene)"
         )
     if asset.reflects and opened.appearance != recorded["appearance"]:
-        warnings.warn(
-            "the scene's materials changed since it was precomputed: light that they reflect onto"
-            " other surfaces is still that of the old ones",
-            LightWarning,
-            stacklevel=2,
-        )
+        warnings.warn(REPAINTED, LightWarning, stacklevel=2)
     return opened
 
 

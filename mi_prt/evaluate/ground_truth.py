@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..render.developed import rendered
 from ..render.image import check_samples
 from ..scene.bounds import scale_of
 from ..system.runtime import mitsuba
@@ -315,9 +316,6 @@ def image(mi_scene, sensor, spp, seed=0, max_depth=2):
     half = max(1, (spp + 1) // 2)
     check_samples(sensor, half)
     first, second = (
-        np.array(mi.render(mi_scene, sensor=sensor, integrator=integrator, spp=half, seed=s))[
-            ..., :3
-        ]
-        for s in (2 * seed, 2 * seed + 1)
+        rendered(mi_scene, sensor, integrator, half, s) for s in (2 * seed, 2 * seed + 1)
     )
     return Reference((first + second) / 2, np.abs(first - second) / 2)

@@ -3,8 +3,9 @@
 import numpy as np
 from scipy.spatial import cKDTree
 
+from ..scene.bounds import box_of
+from ..scene.mesh import mesh_arrays
 from ..scene.own_lights import is_dark
-from ..scene.scene import mesh_arrays
 from ..scene.traversal import transform_of
 from ..system.runtime import mitsuba
 
@@ -62,8 +63,7 @@ def _distance(emitter, shape, positions):
     kind = shape.class_name()
     if kind in _SHAPES and _is_round(to_world := transform_of(shape)):
         return _SHAPES[kind](to_world, positions)
-    box = shape.bbox()
-    low, high = (np.array(x, dtype=np.float64).ravel() for x in (box.min, box.max))
+    low, high = box_of(shape)
     return np.linalg.norm(positions - np.clip(positions, low, high), axis=1)
 
 

@@ -40,7 +40,7 @@ class EnvironmentMap(DistantPart):
     Parameters
     ----------
     source : path, (h, w, 3) array, or mi.Bitmap
-        EXR files are read by OpenEXR; other image formats by Mitsuba. Linear RGB, W/(m²·sr).
+        Files are read by Mitsuba, as those of a scene's own envmap are. Linear RGB, W/(m²·sr).
     rotation : (3, 3) array, default identity
         Orthonormal matrix that takes directions of the map's frame to the world's (`to_world`).
     scale : float, default 1

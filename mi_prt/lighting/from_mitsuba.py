@@ -35,7 +35,9 @@ def scene_light(scene):
     distant = [own for own in scene.own_lights if own.is_distant]
     if not distant:
         raise LightError(
-            "the scene has no distant light (envmap, constant, sunsky, directional): pass a light"
+            "the scene has no distant light (envmap, constant, sunsky, directional): pass a light,"
+            " such as --envmap sky.exr or --light directional:…; for its own lamps precompute it"
+            " with --transports own"
         )
     return Light(tuple(map(distant_part, distant)))
 
@@ -58,6 +60,24 @@ def distant_part(own):
         part = _part_of(own.emitter)
         _known[own] = digest_of([own.emitter]), part
     return part
+
+
+def check_distant(scene):
+    """Refuse distant light of a scene that cannot be used, before anything is computed for it.
+
+    Analytic skies are not looked at: they are what Mitsuba makes them.
+
+    Raises
+    ------
+    LightError
+        See `scene_light`; it names the light.
+    """
+    for own in scene.own_lights:
+        if own.is_distant and own.kind in _CONVERSIONS:
+            try:
+                distant_part(own)
+            except LightError as error:
+                raise LightError(f"the scene's own light '{own.name}': {error}") from None
 
 
 def known_part(own):

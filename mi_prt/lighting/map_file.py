@@ -5,7 +5,9 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import LightError
-from ..system.runtime import mitsuba
+from ..system.runtime import a_worker_at_least, mitsuba
+
+_COLOURS = "RGB", "XYZ", "Y"  # names of channels of which Mitsuba makes colours
 
 
 def read_pixels(source):
@@ -14,7 +16,7 @@ def read_pixels(source):
         path = Path(source)
         if not path.is_file():
             raise LightError(f"environment map '{path}' does not exist")
-        return _read_exr(path) if path.suffix.lower() == ".exr" else _read_by_mitsuba(path)
+        return _read(path)
     if type(source).__module__.startswith("mitsuba"):
         return _from_bitmap(source)
     try:
@@ -26,44 +28,54 @@ def read_pixels(source):
         ) from None
 
 
-def _read_exr(path):
-    import OpenEXR
-
-    try:
-        with OpenEXR.File(str(path), separate_channels=True) as file:
-            channels = {name: channel.pixels for name, channel in file.channels().items()}
-    except Exception as error:  # OpenEXR raises bare RuntimeErrors
-        raise LightError(
-            f"environment map '{path}' cannot be read as OpenEXR: {_one_line(error)}"
-        ) from None
-    missing = [name for name in "RGB" if name not in channels]
-    if missing:
-        raise LightError(
-            f"environment map '{path}' has the channels {', '.join(sorted(channels)) or 'none'} and"
-            f" lacks {', '.join(missing)}: write it with R, G and B"
-        )
-    return np.stack([channels[name] for name in "RGB"], axis=-1)
-
-
-def _read_by_mitsuba(path):
+def _read(path):
+    """Pixels of a file, by the reader that an envmap of a scene goes through: Mitsuba's, which
+    takes primaries from the header of an EXR, and a grey map as grey light.
+    """
     mi = mitsuba()
     try:
-        return _from_bitmap(mi.Bitmap(str(path)))
+        with a_worker_at_least():
+            bitmap = mi.Bitmap(str(path))
+            if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel:
+                _check_primaries(path)
+            return _from_bitmap(bitmap, f"environment map '{path}'")
     except RuntimeError as error:
-        raise LightError(f"environment map '{path}' cannot be read: {_one_line(error)}") from None
+        raise LightError(
+            f"environment map '{path}' cannot be read: {' '.join(str(error).split())}"
+        ) from None
 
 
-def _from_bitmap(bitmap):
+def _check_primaries(path):
+    """Raise LightError where colours beside other channels are of primaries of their own: Mitsuba
+    takes these from files of colours alone.
+    """
+    import OpenEXR
+
+    with OpenEXR.File(str(path), header_only=True) as file:
+        if "chromaticities" in file.header():
+            raise LightError(
+                f"environment map '{path}' has colours of primaries of its own (chromaticities)"
+                " beside other channels: write it with R, G and B alone"
+            )
+
+
+def _from_bitmap(bitmap, what="the bitmap"):
     mi = mitsuba()
     if not isinstance(bitmap, mi.Bitmap):
         raise LightError(
             "an environment map is a path, an array (h, w, 3) or a mi.Bitmap, got"
             f" {type(bitmap).__name__}"
         )
-    return np.array(
-        bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=False)
-    )
-
-
-def _one_line(error):
-    return " ".join(str(error).split())
+    kinds = mi.Bitmap.PixelFormat
+    names = [field.name for field in bitmap.struct_()]
+    many = bitmap.pixel_format() == kinds.MultiChannel  # colours beside others, such as depth
+    if not any(set(colours) <= set(names) for colours in (_COLOURS[:1] if many else _COLOURS)):
+        missing = [name for name in "RGB" if name not in names]
+        raise LightError(
+            f"{what} has the channels {', '.join(sorted(names)) or 'none'} and lacks"
+            f" {', '.join(missing)}: write it with R, G and B"
+        )
+    if many:
+        pixels = np.array(bitmap).astype(np.float32)
+        return np.stack([pixels[..., names.index(name)] for name in "RGB"], axis=-1)
+    return np.array(bitmap.convert(kinds.RGB, mi.Struct.Type.Float32, srgb_gamma=False))

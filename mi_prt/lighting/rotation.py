@@ -45,7 +45,11 @@ def orthonormal(matrix):
     """
     matrix = np.asarray(matrix, dtype=np.float64)
     if matrix.shape != (3, 3) or not np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-4):
-        raise LightError("an environment's to_world must be a rotation without scale or shear")
+        raise LightError(
+            "an environment's to_world must be a rotation, or a mirror, and this one scales or"
+            " shears (Mitsuba would distort the map by it): leave the scale out; brightness is the"
+            " envmap's own 'scale'"
+        )
     return matrix
 
 

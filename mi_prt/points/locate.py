@@ -3,7 +3,7 @@
 import numpy as np
 
 from ..errors import SceneError
-from ..scene.scene import mesh_arrays
+from ..scene.mesh import mesh_arrays
 from ..scene.surface_table import SurfaceTable
 from ..system.runtime import mitsuba
 from .layout import Locator

@@ -97,7 +97,7 @@ def trace_particles(scene, count, seed=0):
     import drjit as dr
 
     mi = mitsuba()
-    table, box = SurfaceTable(scene.surfaces), _outer_box(scene.mi_scene.bbox())
+    table, box = SurfaceTable(scene.surfaces), _outer_box(scene.bounds)
     offset = dr.opaque(mi.Float, _OFFSET * scene.scale)
     hits, flights, found = [], [], 0
     for run in range(_MOST_RUNS):
@@ -115,7 +115,7 @@ def trace_particles(scene, count, seed=0):
             ray = mi.Ray3f(
                 dr.select(alive, origin, fresh[0]), dr.select(alive, direction, fresh[1])
             )
-            si = scene.occluders.ray_intersect(ray)
+            si = scene.intersect(ray)
             normals, si.wi, reflects = facing(si, ray, scene.surfaces)
             # Off an edge a ray can start beyond the other wall, and meet the outer side of that.
             met = si.is_valid() & reflects & (si.t > offset)
@@ -225,7 +225,7 @@ def cross_surfaces(scene, centre, radius, seed=0):
 
             def step(number, origin, active):
                 ray = mi.Ray3f(origin, line.d)
-                si = scene.occluders.ray_intersect(ray, active)
+                si = scene.intersect(ray, active)
                 normals, si.wi, reflects = facing(si, ray, scene.surfaces)
                 active &= si.is_valid() & (dr.dot(si.p - centre, line.d) < extent)
                 met = active & reflects & (dr.norm(si.p - centre) < extent)
@@ -256,15 +256,11 @@ def _source_rays(scene, count, seed):
     kinds = [kind for kind in kinds if kind]
     rays = []
     if not kinds:
-        box = scene.mi_scene.bbox()
+        low, high = scene.bounds
+        centre = mi.Point3f(*map(float, (low + high) / 2))
         sampler.seed(seed, count)
         rays.append(
-            (
-                _lines(
-                    sampler, box.center(), mi.Float(0.5 * np.linalg.norm(np.array(box.extents())))
-                ),
-                count,
-            )
+            (_lines(sampler, centre, mi.Float(float(np.linalg.norm(high - low)) / 2)), count)
         )
     for k, kind in enumerate(kinds):
         total = _share(count, k, len(kinds))
@@ -334,8 +330,8 @@ class _Box:
         return dr.maximum(dr.min(far), 0)
 
 
-def _outer_box(box):
-    low, high = np.array(box.min, np.float32).ravel(), np.array(box.max, np.float32).ravel()
+def _outer_box(bounds):
+    low, high = bounds.astype(np.float32)
     margin = OUTSIDE * (high - low).max()
     return _Box(low - margin, high + margin)
 

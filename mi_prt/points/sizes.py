@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse
 
-from ..scene.scene import mesh_arrays
+from ..scene.mesh import mesh_arrays
 from ..scene.traversal import transform_of
 
 REACH = 2.0  # sizes of an object within which edges are shortest

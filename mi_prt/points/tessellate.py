@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..errors import SceneError
-from ..scene.scene import mesh_arrays
+from ..scene.mesh import mesh_arrays
 from ..scene.traversal import transform_of
 from .lattice import lattice_nodes, lattice_triangles, leaf_triangles, node_count
 from .quadtree import with_middles

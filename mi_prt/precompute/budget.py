@@ -83,7 +83,7 @@ class Budget:
     """
 
     def __init__(self, limit, scene, points, directions, settings, target):
-        _ = scene.occluders
+        _ = scene.occluders, scene.interaction
         held = resident_bytes()
         n, s, rays = len(points), len(directions), settings.rays_per_direction
         components = target.components or 0

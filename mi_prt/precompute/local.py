@@ -68,7 +68,7 @@ class LocalBuilder(Builder):
         settings, n, c = self.job.settings, len(self.job.points), len(self._slices)
         columns = c * settings.transfer_coefficients * self._channels
         largest = int(np.diff(self._clusters.starts).max())
-        _ = self.job.scene.occluders
+        _ = self.job.scene.occluders, self.job.scene.interaction
         directions = settings.depth_directions
         needed = (
             Examples.bytes(n, settings.example_lights)

@@ -42,7 +42,7 @@ class OwnBuilder(Builder):
 
     def _lanes_within(self, limit):
         """Lanes of a wavefront that fit beside what must be held."""
-        _ = self.job.scene.occluders
+        _ = self.job.scene.occluders, self.job.scene.interaction
         needed = COLUMN_BYTES * len(self.job.points) * len(self._lights)
         return wavefront_lanes(limit, int(needed), LANE_BYTES, "points")
 

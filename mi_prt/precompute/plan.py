@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ..errors import SettingsError
+from ..lighting.from_mitsuba import check_distant
 from .job import BUILDERS
 from .settings import BY_NAME, TRANSPORTS, Settings
 
@@ -46,12 +47,16 @@ def make_plan(scene, given):
     ------
     SettingsError
         If a setting is unknown, out of range, or of points or transports that will not be there.
+    LightError
+        If distant light of the scene cannot be used.
     """
     unknown = [name for name in given if name not in BY_NAME]
     if unknown:
         raise SettingsError(f"'{unknown[0]}' is no setting: use {', '.join(BY_NAME)}")
     asked = Settings(**given)
     transports, reasons = _transports(scene, asked, given)
+    if "distant" in transports:
+        check_distant(scene)
     points, reasons["points"] = _points(scene, asked, given, transports)
     groups = {"general", points, *transports}
     for name in given:

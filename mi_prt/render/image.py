@@ -6,6 +6,7 @@ import numpy as np
 
 from ..errors import SettingsError
 from ..system.runtime import mitsuba
+from .developed import rendered
 from .integrator import integrator_for
 
 MAX_PIXELS = 1 << 26
@@ -41,9 +42,7 @@ def render_image(asset, mi_scene, sensor, spp=64, seed=0, irradiance=None, direc
     """
     check_samples(sensor, spp)
     integrator = integrator_for(asset, irradiance, direct)
-    return np.array(
-        mitsuba().render(mi_scene, sensor=sensor, integrator=integrator, spp=spp, seed=seed)
-    )[..., :3]
+    return rendered(mi_scene, sensor, integrator, spp, seed)
 
 
 def check_samples(sensor, spp):
@@ -86,9 +85,16 @@ def resized(sensor, size):
     Raises
     ------
     SettingsError
-        If a side is below 1 or the image would have more than 67 million pixels.
+        If a side is below 1, here or of the film, or the image would have more than 67 million
+        pixels.
     """
     if size is None:
+        width, height = sensor.film().crop_size()
+        if min(width, height) < 1:
+            raise SettingsError(
+                f"the sensor's film has {width}x{height} pixels: give it a width and a height of at"
+                " least 1, or an image size (--size WxH)"
+            )
         yield sensor
         return
     width, height = size
@@ -120,8 +126,11 @@ def coverage(mi_scene, sensor, spp, seed=0):
     class Coverage(mi.SamplingIntegrator):
         def sample(self, scene, sampler, ray, medium=None, active=True):
             hit = scene.ray_intersect_preliminary(ray, coherent=True, active=active).is_valid()
-            return mi.Color3f(mi.Float(hit)), active, []
+            return mi.Color3f(0), active, [mi.Float(hit)]
+
+        def aov_names(self):
+            return ["hit"]  # beside the colour, which the film may convert
 
     return np.array(
         mi.render(mi_scene, sensor=sensor, integrator=Coverage(mi.Properties()), spp=spp, seed=seed)
-    )[..., 0]
+    )[..., -1]

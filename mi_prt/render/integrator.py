@@ -1,16 +1,20 @@
 """The Mitsuba integrator `prt`: any sensor and film, lit from an asset in one ray per sample."""
 
+import warnings
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 
 from ..asset.asset import load
+from ..asset.provenance import REPAINTED
 from ..errors import SettingsError
+from ..lighting.environment import LightWarning
 from ..scene.scene import Scene, SceneSource
 from ..scene.traversal import digest_of
 from ..system.runtime import VARIANTS, mitsuba
 from .direct_light import LocalEmitters
+from .repainted import is_repainted
 from .shade import reflected_radiance
 
 DIRECT = ("points", "pixels")
@@ -33,10 +37,17 @@ def register_integrator():
 
 
 def _register(variant):
-    if variant in VARIANTS:
-        import mitsuba as mi
+    if variant is None:
+        return
+    import mitsuba as mi
 
-        mi.register_integrator("prt", _plugin_class(variant))
+    made = _plugin_class(variant) if variant in VARIANTS else _refused
+    mi.register_integrator("prt", made)
+
+
+def _refused(properties):
+    """In place of the plugin in other variants, in which it would not be found."""
+    return mitsuba()  # raises: it names the variants that can be set
 
 
 @cache
@@ -72,6 +83,11 @@ def _plugin_class(variant):
             When rendering a scene without such emitters.
         SettingsError
             If `direct` is another.
+
+        Warns
+        -----
+        LightWarning
+            When rendering a scene whose materials are not those of the asset's reflected light.
         """
 
         def __init__(self, properties, asset=None, irradiance=None, direct=None):
@@ -93,6 +109,10 @@ def _plugin_class(variant):
                 self._scene = None  # until the new one is known to fit
                 self._locator = self.asset.points.locator(opened)
                 self._wrapped, self._scene, self._light = opened, scene, None
+                self._warn_of_paint(opened)
+            elif self._wrapped.appearance != opened.appearance:
+                self._wrapped = opened
+                self._warn_of_paint(opened)
             light = digest_of(opened.mi_scene.emitters())
             if self._light == light:
                 return
@@ -103,6 +123,11 @@ def _plugin_class(variant):
                     under_emitters(self.asset, opened, self._direct).ravel()
                 )
             self._light = light
+
+        def _warn_of_paint(self, opened):
+            # Whoever gives the irradiance has opened the scene, and been told.
+            if self._follows_emitters and is_repainted(self.asset, opened):
+                warnings.warn(REPAINTED, LightWarning, stacklevel=4)
 
         def sample(self, scene, sampler, ray, medium=None, active=True):
             if self._scene is not scene:
@@ -132,7 +157,7 @@ def _plugin_class(variant):
 
             def trace(ray, active):
                 pi = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
-                si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
+                si = self._wrapped.interaction(pi, ray, active)  # pyright: ignore[reportOptionalMemberAccess]
                 return pi, si, active & si.is_valid() & si.shape.is_emitter()
 
             pi, si, lamp = trace(ray, active)

@@ -1,11 +1,14 @@
 """The box around a scene."""
 
+import warnings
+
 import numpy as np
 
 from ..errors import SceneError
 
 WIDE = 1 / 16  # of the scene's size, above which a shape may be a ground to all others
 LEAST = 1 / 64  # of the largest coordinates and sizes, that offsets are at least measured by
+FAR = 1000  # extents of a scene from the origin, from which on it is blurred
 
 
 def bounds_of(mi_scene):
@@ -70,3 +73,19 @@ def scale_of(mi_scene):
 def _diagonal(boxes):
     """Of boxes (…, 2, 3)."""
     return np.linalg.norm(boxes[..., 1, :] - boxes[..., 0, :], axis=-1)
+
+
+def warn_if_far(mi_scene):
+    """Warn of a scene so far from the origin that single precision blurs it, in Mitsuba too."""
+    low, high = box = _box(mi_scene)
+    if not np.isfinite(box).all():
+        return  # told later, by the shape
+    extent, farthest = np.linalg.norm(high - low), np.abs(box).max()
+    if farthest > FAR * extent > 0:
+        step = np.spacing(np.float32(farthest))
+        warnings.warn(
+            f"the scene of {extent:.3g} m lies {farthest:.3g} m from the origin, where single"
+            f" precision places things to {step:.2g} m: Mitsuba's own pictures of it are damaged,"
+            " and so is what is computed here; move it to the origin",
+            stacklevel=3,
+        )

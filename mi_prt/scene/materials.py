@@ -38,8 +38,8 @@ class Material:
     left_out: tuple
 
     def left_out_albedo(self, samples=4096, seed=0):
-        """Share of light at 45° that the material scatters in ways that are left out, averaged over
-        uv, 0…1.
+        """Share of light at 45° that the material scatters beyond its model, averaged over uv;
+        below 0 where the model scatters more, −1…1.
         """
         if not self.left_out:
             return 0.0
@@ -58,7 +58,7 @@ class Material:
         _, weight = self.bsdf.sample(mi.BSDFContext(), si, sampler.next_1d(), sampler.next_2d())
         scattered = float(np.mean(np.array(weight)))
         diffuse = float(np.mean(np.array(self.modelled.eval_diffuse_reflectance(si))))
-        return float(np.clip(scattered - diffuse, 0.0, 1.0))
+        return float(np.clip(scattered - diffuse, -1.0, 1.0))
 
 
 def model_material(bsdf):

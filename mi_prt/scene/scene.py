@@ -8,11 +8,11 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from ..errors import SceneError
 from ..system.runtime import a_worker_at_least, mitsuba
-from .bounds import scale_of
+from .bounds import bounds_of, scale_of, warn_if_far
+from .interactions import make_interactions
+from .mesh import mesh_arrays
 from .own_lights import list_own_lights
 from .rebuild import check_can_be_copied, kept_parts, rebuilt_scene
 from .surface import list_surfaces
@@ -71,9 +71,6 @@ class Scene:
         self.surfaces = tuple(list_surfaces(mi_scene))
         if not self.surfaces:
             raise SceneError("the scene holds no shapes: there is nothing to light")
-        empty = [s.name for s in self.surfaces if s.kind == "mesh" and s.shape.face_count() == 0]
-        if empty:  # Dr.Jit cannot read from arrays without entries
-            raise SceneError(f"the mesh '{empty[0]}' has no faces: remove it from the scene")
         self.own_lights = list_own_lights(mi_scene)
 
     @property
@@ -85,6 +82,11 @@ class Scene:
     def local_emitters(self):
         """All other mi.Emitters, a tuple."""
         return tuple(own.emitter for own in self.own_lights if not own.is_distant)
+
+    @cached_property
+    def bounds(self):
+        """See `bounds_of`."""
+        return bounds_of(self.mi_scene)
 
     @cached_property
     def scale(self):
@@ -99,6 +101,16 @@ class Scene:
         through shared edges.
         """
         return rebuilt_scene([c for _, c in self._children if isinstance(c, mitsuba().Shape)])
+
+    @cached_property
+    def interaction(self):
+        """Surface interactions of hits in it, see `make_interactions`."""
+        return make_interactions(self.surfaces)
+
+    def intersect(self, ray, active=True):
+        """The surface interactions (mi.SurfaceInteraction3f) of rays, watertight."""
+        pi = self.occluders.ray_intersect_preliminary(ray, coherent=True, active=active)
+        return self.interaction(pi, ray, active)
 
     @cached_property
     def hash(self):
@@ -235,30 +247,8 @@ def _loaded(what, load, *arguments, **parameters):
         raise SceneError(f"Mitsuba rejects {what}: {' '.join(str(error).split())}") from None
     if not isinstance(scene, mitsuba().Scene):
         raise SceneError(f"{what} is a {type(scene).__name__}, not a scene")
+    warn_if_far(scene)
     return scene
-
-
-def mesh_arrays(mesh):
-    """Buffers of a mesh in its own frame.
-
-    Returns
-    -------
-    positions : (v, 3) float32
-    faces : (f, 3) int64
-    normals : (v, 3) float32 or None
-        Shading normals as Mitsuba uses them (flip_normals applied); None if the mesh is faceted.
-    uv : (v, 2) float32 or None
-    """
-    positions = np.array(mesh.vertex_positions_buffer(), dtype=np.float32).reshape(-1, 3)
-    faces = np.array(mesh.faces_buffer(), dtype=np.int64).reshape(-1, 3)
-    normals = uv = None
-    if mesh.has_vertex_normals() and not mesh.has_face_normals():
-        normals = np.array(mesh.vertex_normals_buffer(), dtype=np.float32).reshape(-1, 3)
-        if mesh.has_flipped_normals():
-            normals = -normals
-    if mesh.has_vertex_texcoords():
-        uv = np.array(mesh.vertex_texcoords_buffer(), dtype=np.float32).reshape(-1, 2)
-    return positions, faces, normals, uv
 
 
 def _holds_objects(content):

@@ -29,7 +29,30 @@ def children(node):
 
 def transform_of(node):
     """An object's `to_world` as (4, 4) float64."""
-    return np.array(mitsuba().traverse(node)["to_world"].matrix, dtype=np.float64).reshape(4, 4)
+    found = find_transform(node)
+    if found is None:
+        raise KeyError("to_world")
+    return found
+
+
+def find_transform(node):
+    """An object's `to_world` as (4, 4) float64; None if it has none."""
+    mi = mitsuba()
+
+    class Finder(mi.TraversalCallback):
+        def __init__(self):
+            super().__init__()
+            self.found = None
+
+        def put(self, name, value, flags, cpptype=None):
+            if name == "to_world" and cpptype is not None:
+                self.found = mi.get_property(value, cpptype, node)
+
+    finder = Finder()
+    node.traverse(finder)
+    if finder.found is None:
+        return None
+    return np.array(finder.found.matrix, dtype=np.float64).reshape(4, 4)
 
 
 def digest_of(nodes, keep=lambda key: True):

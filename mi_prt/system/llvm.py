@@ -14,6 +14,7 @@ import shutil
 import subprocess
 import sys
 from dataclasses import dataclass
+from functools import cache
 from glob import glob
 
 from ..errors import RuntimeSetupError
@@ -147,6 +148,7 @@ def find_libraries(directories: list[str] | None = None) -> list[Library]:
     return _ranked(found)
 
 
+@cache
 def library_version(path: str) -> int | None:
     """Major version of a libLLVM as told by its name, the name behind its symbolic link, or its
     folder (`llvm-19`).

@@ -191,7 +191,7 @@ def _all_inside(scene, points, vectors):
     toward *= np.where(np.sum(toward * normals, axis=1) < 0, -1, 1)[:, None].astype(np.float32)
     origins = points.ray_origins(RAY_OFFSET * scene.scale)
     ray = mi.Ray3f(mi.Point3f(np.repeat(origins, count, axis=0).T), mi.Vector3f(toward.T))
-    hit = scene.occluders.ray_intersect(ray)
+    hit = scene.intersect(ray)
     near = np.minimum(1e-3 * scene.scale, 0.1 * np.sqrt(points.areas)).astype(np.float32)
     near = mi.Float(np.repeat(near, count))
     inside = hit.is_valid() & ((dr.dot(hit.n, ray.d) > 0) | (hit.t < near))

@@ -102,7 +102,7 @@ class HemisphereTracer:
         origin = dr.gather(mi.Point3f, self._origins, local + dr.opaque(mi.UInt32, first))
         ray = mi.Ray3f(origin, direction)
         pi = self._scene.occluders.ray_intersect_preliminary(ray)
-        si = pi.compute_surface_interaction(ray)
+        si = self._scene.interaction(pi, ray, True)
         _, si.wi, reflects = facing(si, ray, self._scene.surfaces)
         reflects &= si.is_valid()
         upward = mi.Vector3f(x.z, y.z, z.z)

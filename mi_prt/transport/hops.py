@@ -223,7 +223,7 @@ class HopSampler:
         ray = mi.Ray3f(origin, dr.gather(mi.Vector3f, mi.Float(directions.ravel()), lane))
         active = dr.gather(mi.Bool, mi.Bool(active), local)
         pi = self._scene.occluders.ray_intersect_preliminary(ray, active=active)
-        si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
+        si = self._scene.interaction(pi, ray, active)
         _, si.wi, reflects = facing(si, ray, self._scene.surfaces)
         # The number is hashed from point and ray, so that it depends on nothing else.
         number = (

@@ -107,7 +107,7 @@ class LampRays:
         ray = mi.Ray3f(dr.gather(mi.Point3f, self._positions, point) + away, direction)
         surfaces = self._scene.surfaces
         pi = self._scene.occluders.ray_intersect_preliminary(ray)
-        si = pi.compute_surface_interaction(ray, mi.RayFlags.All)
+        si = self._scene.interaction(pi, ray, True)
         normals, si.wi, reflects = facing(si, ray, surfaces)
         reflects &= si.is_valid()
         albedo = reflectance_at(si, surfaces, reflects)

@@ -6,6 +6,7 @@
 import numpy as np
 
 from ..errors import LightError
+from ..scene.bounds import box_of
 from ..system.runtime import mitsuba
 from .bits import RAY_OFFSET
 
@@ -38,7 +39,7 @@ class Lamps:
             _check(emitter)
         ids = [dr.reinterpret_array(mi.UInt32, mi.EmitterPtr(e))[0] for e in emitters]
         self._ids = mi.UInt32(np.array(ids, np.uint32))
-        self._occluders = scene.occluders
+        self._scene, self._occluders = scene, scene.occluders
         self._offset = dr.opaque(mi.Float, RAY_OFFSET * scene.scale)
         # whether a lamp is a place without extent, to which one ray is exact
         self.are_places = np.array([_is_place(e) for e in emitters], bool)
@@ -122,7 +123,7 @@ class Lamps:
 
         mi = mitsuba()
         emitter = self.emitter(lamp)
-        si = self._occluders.ray_intersect(mi.Ray3f(origin, direction))
+        si = self._scene.intersect(mi.Ray3f(origin, direction))
         hit = si.is_valid() & (si.shape.emitter() == emitter)
         sample = mi.DirectionSample3f(self._occluders, si, _seen(origin))
         density = emitter.pdf_direction(_seen(origin), sample, hit)
@@ -164,10 +165,7 @@ def averaging(cosine, distance, footprint):
 def _box(emitter):
     """Corners (2, 3) of the box around an emitter's shape; 0 without one."""
     shape = emitter.get_shape()
-    if shape is None:
-        return np.zeros((2, 3))
-    box = shape.bbox()
-    return np.array([box.min, box.max], dtype=np.float64).reshape(2, 3)
+    return np.zeros((2, 3)) if shape is None else box_of(shape)
 
 
 def _area(emitter):

@@ -151,16 +151,11 @@ class PathSampler:
         normal = dr.gather(mi.Normal3f, self._normals, owner)
         origin = dr.gather(mi.Point3f, self._origins, owner)
         direction = mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(place))
-        scene, occluders, offset, most = (
-            self._scene,
-            self._scene.occluders,
-            self._offset,
-            self._bounces,
-        )
+        scene, offset, most = self._scene, self._offset, self._bounces
 
         def step(origin, direction, throughput, reflections, active, random):
             ray = mi.Ray3f(origin, direction)
-            si = occluders.ray_intersect(ray, mi.RayFlags.All, True, active)
+            si = scene.intersect(ray, active)
             hit = active & si.is_valid()
             escaped = active & ~hit
             normal, si.wi, reflects = facing(si, ray, scene.surfaces)

@@ -1,7 +1,26 @@
 """Materials with a diffuse texture under other lobes, which are left out."""
 
 from ...system.runtime import mitsuba
+from ..albedo import albedo_texture, measure_coat
 from . import MATERIALS, black
+
+
+def _plastic(kind, lobes):
+    """A plastic whose base is met once reflects its parameter, beside its coat; that of one with
+    `nonlinear` is no albedo, and what the coat reflects is spread evenly with the rest.
+    """
+
+    @MATERIALS.add(kind)
+    def model(bsdf, children, model_child):
+        reflectance, coat = dict(children)["diffuse_reflectance"], measure_coat(bsdf)
+        if coat.keeps_parameter:
+            left_out = f"{kind}: {lobes}"
+        else:
+            reflectance = albedo_texture(reflectance, coat)
+            left_out = f"{kind}: {lobes} (its light is spread evenly)"
+        return mitsuba().load_dict({"type": "diffuse", "reflectance": reflectance}), (left_out,)
+
+    return model
 
 
 def _coated(kind, texture, lobes):
@@ -21,8 +40,8 @@ def _coated(kind, texture, lobes):
     return model
 
 
-plastic = _coated("SmoothPlastic", "diffuse_reflectance", "specular coat")
-rough_plastic = _coated("RoughPlastic", "diffuse_reflectance", "glossy coat")
+plastic = _plastic("SmoothPlastic", "specular coat")
+rough_plastic = _plastic("RoughPlastic", "glossy coat")
 principled = _coated(
     "Principled", "base_color", "specular, sheen, clearcoat and transmission lobes"
 )
