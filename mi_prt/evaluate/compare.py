@@ -11,10 +11,14 @@ import numpy as np
 
 from ..asset.provenance import open_scene_of
 from ..errors import SettingsError
+from ..lighting.light import Light
 from ..lighting.to_mitsuba import lit_scene
 from ..render.image import pick_sensor, render_image, resized
+from ..render.integrator import check_direct
 from ..render.picture import Picture
+from ..render.rendered import check_picture
 from ..scene.scene import Scene
+from ..transport.transport import Question
 from . import ground_truth
 from .local_lights import stand_in_error
 from .near_emitters import near_emitters
@@ -95,6 +99,9 @@ def compare(
     """
     if reference not in REFERENCES:
         raise SettingsError(f"reference '{reference}' is not known: use {' or '.join(REFERENCES)}")
+    check_picture(size, sensor, spp, seed)
+    check_direct(direct)
+    Question(Light(()), nearest=nearest)  # which checks it
     if spp < 2:
         raise SettingsError(
             f"spp {spp} is too low: the reference's noise is told from two halves, so at least 2"

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..render.image import check_samples
+from ..render.rendered import rendered
 from ..scene.scene import scale_of
 from ..system.runtime import mitsuba
 
@@ -307,17 +307,12 @@ def image(mi_scene, sensor, spp, seed=0, max_depth=2):
 
     Raises
     ------
-    SettingsError
-        See `check_samples`.
+    SettingsError, SceneError
+        See `rendered`.
     """
-    mi = mitsuba()
-    integrator = mi.load_dict({"type": "path", "max_depth": max_depth})
+    integrator = mitsuba().load_dict({"type": "path", "max_depth": max_depth})
     half = max(1, (spp + 1) // 2)
-    check_samples(sensor, half)
     first, second = (
-        np.array(mi.render(mi_scene, sensor=sensor, integrator=integrator, spp=half, seed=s))[
-            ..., :3
-        ]
-        for s in (2 * seed, 2 * seed + 1)
+        rendered(mi_scene, sensor, integrator, half, s)[..., :3] for s in (2 * seed, 2 * seed + 1)
     )
     return Reference((first + second) / 2, np.abs(first - second) / 2)

@@ -6,6 +6,7 @@ import numpy as np
 
 from ..errors import LightError
 from ..system.runtime import mitsuba
+from ..system.workers import a_worker_at_least
 
 
 def read_pixels(source):
@@ -48,7 +49,9 @@ def _read_exr(path):
 def _read_by_mitsuba(path):
     mi = mitsuba()
     try:
-        return _from_bitmap(mi.Bitmap(str(path)))
+        with a_worker_at_least():  # an OpenEXR file may have any name
+            bitmap = mi.Bitmap(str(path))
+        return _from_bitmap(bitmap)
     except RuntimeError as error:
         raise LightError(f"environment map '{path}' cannot be read: {_one_line(error)}") from None
 

@@ -12,9 +12,11 @@ import numpy as np
 from ..errors import SettingsError
 from ..render.image_file import to_8bit, write_displayed
 from ..system.files import check_writable, replacing
+from ..system.whole import check_whole
 
 VIDEOS = (".mp4", ".gif")
 FRAMES, FPS = 48, 25  # of a film, by default
+MAX_FRAMES = 100_000  # more than an hour
 MAX_FPS = {".mp4": 240, ".gif": 50}  # viewers slow down a GIF of more
 PATH_FORM = "write it as 'x,y,z x,y,z …', two or more positions separated by spaces or semicolons"
 _STEPS = 1024  # of the polygon that measures and stands for each piece of a path
@@ -68,10 +70,9 @@ class LightPath:
         Raises
         ------
         SettingsError
-            If `frames` is not an integer ≥ 1.
+            If `frames` is not an integer from 1 to `MAX_FRAMES`.
         """
-        if isinstance(frames, bool) or not isinstance(frames, int | np.integer) or frames < 1:
-            raise SettingsError(f"frames must be an integer ≥ 1, got {frames!r}")
+        check_whole("frames", frames, 1, MAX_FRAMES, "write longer films in parts")
         polygon = self._polygon()
         length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(polygon, axis=0), axis=1))])
         wanted = np.linspace(0, length[-1], frames, endpoint=not self.closed)

@@ -8,7 +8,10 @@ from ..asset.provenance import open_scene_of
 from ..errors import LightError
 from ..lighting.light import Light
 from ..render.display import display
+from ..render.integrator import check_direct
 from ..render.picture import RENDERERS, Picture
+from ..render.rendered import check_picture
+from ..transport.transport import Question
 from .film import FPS, FRAMES, check_frames_output, write_frames
 
 FRAME_SAMPLES = 1  # of a frame's pixel, along each side, of splats
@@ -52,10 +55,13 @@ def animate(
         points, frames, seconds{relight, render} of all frames.
     """
     RENDERERS[renderer]
+    check_picture(size, sensor, spp)
+    check_direct(direct)
+    Question(Light(()), component)  # which checks it
+    places = path.positions(frames)
     check_frames_output(output, fps)
     opened = open_scene_of(asset, scene)
     moving = _Moving(asset.resolved(light, rotate, opened))
-    places = path.positions(frames)
     first = moving.at(places[0])
     film = _Film(Picture(asset, opened, first, component, direct), moving, progress, frames)
     # A light that is a shape is seen: what is drawn changes with its place.

@@ -3,11 +3,16 @@
 import time
 
 from ..asset.provenance import open_scene_of
+from ..errors import SettingsError
 from ..evaluate.local_lights import stand_in_error
+from ..lighting.light import Light
 from ..render.display import exposure
+from ..render.integrator import check_direct
 from ..render.picture import RENDERERS, Picture
+from ..render.rendered import check_picture
 from ..system.files import check_writable
-from .formats import Relit, format_of
+from ..transport.transport import Question
+from .formats import FORMATS, Relit, format_of
 
 
 def relight_to_file(
@@ -71,6 +76,14 @@ def relight_to_file(
     """
     written = format_of(output)
     RENDERERS[renderer]
+    check_picture(size, sensor, spp)
+    Question(Light(()), component, nearest)  # which checks them
+    if check_direct(direct) == "pixels" and not written.is_picture:
+        pictures = " or ".join(name for name in FORMATS if FORMATS[name].is_picture)
+        raise SettingsError(
+            f"direct light at pixels is of pictures, and '{output}' holds points: write {pictures},"
+            " or leave direct (--direct) at points"
+        )
     check_writable(output)
     opened = open_scene_of(asset, scene) if written.is_picture else None
     resolved = asset.resolved(light, rotate, opened or scene)

@@ -7,6 +7,7 @@ import numpy as np
 from ..errors import SettingsError
 from ..system.files import replacing
 from ..system.runtime import mitsuba
+from ..system.workers import a_worker_at_least
 from .display import display
 
 
@@ -32,7 +33,7 @@ def write_image(path, radiance, factor=1.0):
     elif suffix == ".exr":
         mi = mitsuba()
         bitmap = mi.Bitmap(np.ascontiguousarray(radiance, dtype=np.float32))
-        with replacing(path) as temporary:
+        with replacing(path) as temporary, a_worker_at_least():
             bitmap.write(temporary, mi.Bitmap.FileFormat.OpenEXR)
     else:
         raise SettingsError(f"image '{path}' must end in .exr or .png")

@@ -9,6 +9,7 @@ from ..asset.asset import load
 from ..errors import SettingsError
 from ..scene.scene import Scene, SceneSource
 from ..scene.traversal import digest_of
+from ..system.passing import pass_errors_through, remembered
 from ..system.runtime import VARIANTS, mitsuba
 from .direct_light import LocalEmitters
 from .shade import reflected_radiance
@@ -37,6 +38,7 @@ def _register(variant):
         import mitsuba as mi
 
         mi.register_integrator("prt", _plugin_class(variant))
+        pass_errors_through(mi)
 
 
 @cache
@@ -76,8 +78,9 @@ def _plugin_class(variant):
 
         def __init__(self, properties, asset=None, irradiance=None, direct=None):
             super().__init__(properties)
-            self.asset = asset or _load(str(properties["filename"]))
-            self._direct = check_direct(direct or str(properties.get("direct", "points")))
+            with remembered():
+                self.asset = asset or _load(_filename(properties))
+                self._direct = check_direct(direct or str(properties.get("direct", "points")))
             self._follows_emitters = irradiance is None
             self._irradiance = None if irradiance is None else mi.Float(irradiance.ravel())
             self._scene = self._light = self._emitters = None
@@ -220,6 +223,14 @@ def integrator_for(asset, irradiance=None, direct="points"):
                 f"irradiance must be of shape ({len(asset.points)}, 3), got {irradiance.shape}"
             )
     return _plugin_class(mi.variant())(mi.Properties("prt"), asset, irradiance, direct)  # pyright: ignore[reportCallIssue]
+
+
+def _filename(properties):
+    if "filename" not in properties:
+        raise SettingsError(
+            "the integrator prt needs a filename: that of an asset (mi-prt precompute)"
+        )
+    return str(properties["filename"])
 
 
 def _load(filename):

@@ -10,8 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import SceneError
-from ..system.runtime import a_worker_at_least, mitsuba
+from ..errors import PrtError, SceneError
+from ..system.passing import one_line
+from ..system.runtime import mitsuba
+from ..system.workers import a_worker_at_least
 from .own_lights import list_own_lights
 from .rebuild import check_can_be_copied, kept_parts, rebuilt_scene
 from .surface import list_surfaces
@@ -230,8 +232,12 @@ def _loaded(what, load, *arguments, **parameters):
     try:
         with a_worker_at_least():
             scene = load(*arguments, optimize=False, parallel=False, **parameters)
+    except PrtError:  # of a plugin of this package
+        raise
     except Exception as error:  # Mitsuba raises RuntimeError, ValueError and others
-        raise SceneError(f"Mitsuba rejects {what}: {' '.join(str(error).split())}") from None
+        text = one_line(error)
+        hint = " (or a film has no pixels)" if "field of view must" in text else ""
+        raise SceneError(f"Mitsuba rejects {what}: {text}{hint}") from None
     if not isinstance(scene, mitsuba().Scene):
         raise SceneError(f"{what} is a {type(scene).__name__}, not a scene")
     return scene

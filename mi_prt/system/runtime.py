@@ -129,20 +129,13 @@ def set_threads(count: int) -> None:
             f"threads must be an integer from 1 to {most} ({THREADS_PER_CORE} per core), got"
             f" {count!r}"
         )
-    _load("drjit").set_thread_count(count)
+    set_thread_count(count)
 
 
-@contextmanager
-def a_worker_at_least():
-    """Within the block Dr.Jit has a thread beside the calling one: Mitsuba hands the loading of
-    images to it, and waits forever without.
-    """
+def set_thread_count(count: int) -> None:
+    """`set_threads`, unchecked."""
     drjit = _load("drjit")
-    count = drjit.thread_count()
-    drjit.set_thread_count(max(count, 2))
-    try:
-        yield
-    finally:
+    if drjit.thread_count() != count:
         drjit.set_thread_count(count)
 
 
