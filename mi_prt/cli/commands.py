@@ -1,14 +1,12 @@
 """The commands, one function each."""
 
-import sys
 import time
-import warnings
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from ..errors import PrtError, SettingsError
+from ..errors import SettingsError
 from . import options as take
 from .options import (
     LIGHTS_HELP,
@@ -295,36 +293,6 @@ def compare(
             direct=direct,
         )
     _show(result if as_json else {"wrote": str(output / "index.html")} | result, as_json)
-
-
-def main(arguments=None):
-    """Run the program; exit codes: 0 done, 2 bad usage or input, 130 interrupted, 1 anything
-    else.
-    """
-    warnings.showwarning = lambda message, *_, **__: note(str(message))
-    try:
-        from ..system.runtime import quiet_mitsuba
-
-        if not _only_help(sys.argv[1:] if arguments is None else arguments):
-            quiet_mitsuba()
-        app(arguments, standalone_mode=True, prog_name="mi-prt")
-    except PrtError as error:
-        print(f"mi-prt: {error}", file=sys.stderr)
-        sys.exit(error.exit_code)
-    except KeyboardInterrupt:
-        note("interrupted")
-        sys.exit(130)
-    except MemoryError:
-        print(
-            "mi-prt: out of memory: use fewer --directions or a longer --edge-length, or set"
-            " --max-memory",
-            file=sys.stderr,
-        )
-        sys.exit(1)
-
-
-def _only_help(arguments):
-    return not arguments or any(a in ("-h", "--help") for a in arguments)
 
 
 def _show(found, as_json):

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..render.display import LUMINANCE, display
 from ..render.image_file import write_displayed, write_image
+from ..system.files import replacing
 from . import metrics
 
 _PAGE = """<!doctype html>
@@ -72,10 +73,10 @@ def write_report(folder, report, result, reference, covered):
     ):
         write_displayed(folder / f"{name}.png", picture)
     write_displayed(folder / "side_by_side.png", np.concatenate([shown, truth, error], axis=1))
-    (folder / "report.json").write_text(
-        json.dumps(finite(report), indent=2, allow_nan=False) + "\n"
-    )
-    (folder / "index.html").write_text(_page(report))
+    numbers = json.dumps(finite(report), indent=2, allow_nan=False) + "\n"
+    for name, text in (("report.json", numbers), ("index.html", _page(report))):
+        with replacing(folder / name) as temporary:
+            Path(temporary).write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
 def finite(value):

@@ -14,6 +14,7 @@ from ..points.clusters import make_clusters
 from ..points.points import Points, sample_points
 from ..points.samples import scatter_points
 from ..scene.scene import open_scene
+from ..system.files import check_writable
 from ..system.memory import free_bytes, parse_bytes, resident_bytes
 from ..system.runtime import count_kernels, peak_memory_bytes, versions
 from .job import BUILDERS, Clock, Job
@@ -88,6 +89,7 @@ def measure(
         rays, kernels (compiled), peak_memory_bytes, seconds of the stages of this run alone.
     """
     if output is not None:
+        check_writable(output)
         output = Path(output).resolve()
     elif resume:
         raise SettingsError("resume needs the output of the run to continue")

@@ -1,5 +1,6 @@
 """The Mitsuba integrator `prt`: any sensor and film, lit from an asset in one ray per sample."""
 
+import os
 from functools import cache
 from pathlib import Path
 
@@ -237,4 +238,4 @@ def _load(filename):
     import mitsuba as mi
 
     found = Path(str(mi.file_resolver().resolve(filename)))  # pyright: ignore[reportCallIssue]
-    return load(found if found.exists() else filename)
+    return load(found if os.path.exists(found) else filename)

@@ -94,13 +94,13 @@ def check_samples(spp):
     check_whole("spp", spp, 1, MAX_SPP, "the noise of an image falls with the root of its number")
 
 
-def check_size(width, height, remedy="give a smaller one (--size)"):
+def check_size(width, height, remedy="give another one (--size)"):
     """Raise SettingsError unless an image can be of so many pixels."""
-    sides = [check_whole("a side of an image", side, 1, MAX_PIXELS) for side in (width, height)]
-    if sides[0] * sides[1] > MAX_PIXELS:
+    whole = all(isinstance(x, int | np.integer) for x in (width, height))
+    if not whole or min(width, height) < 1 or int(width) * int(height) > MAX_PIXELS:
         raise SettingsError(
-            f"an image of {width}x{height} has {sides[0] * sides[1]:,} pixels, the limit is"
-            f" {MAX_PIXELS:,}: {remedy}"
+            f"image size {width}x{height} must be at least 1x1 and at most {MAX_PIXELS:,} pixels:"
+            f" {remedy}"
         )
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import PrtError, SceneError
+from ..system.files import why_no_file
 from ..system.passing import one_line
 from ..system.runtime import mitsuba
 from ..system.workers import a_worker_at_least
@@ -217,11 +218,8 @@ def open_scene(source, parameters=None):
     if not isinstance(source, str | os.PathLike):
         raise SceneError(f"a scene is a path, a dict or an mi.Scene, got {type(source).__name__}")
     path = Path(source).absolute()
-    if not path.exists():
-        raise SceneError(f"scene '{path}' does not exist")
-    if not path.is_file():
-        what = "a folder" if path.is_dir() else "no regular file"
-        raise SceneError(f"scene '{path}' is {what}: give a Mitsuba XML file")
+    if reason := why_no_file(path):
+        raise SceneError(f"scene '{path}' {reason}: give a Mitsuba XML file")
     loaded = _loaded(f"scene '{path}'", mi.load_file, str(path), **parameters)
     return Scene(loaded, SceneSource("file", str(path), parameters, not Path(source).is_absolute()))
 

@@ -1,11 +1,32 @@
 """Writing files all or nothing."""
 
 import os
+import stat
 import tempfile
 from contextlib import contextmanager
 from pathlib import Path
 
 from ..errors import SettingsError
+
+
+def why_no_file(path):
+    """Why a path leads to no regular file that can be read, in words; None if it does."""
+    try:
+        mode = os.stat(path).st_mode
+    except (FileNotFoundError, NotADirectoryError):
+        return "does not exist"
+    except (OSError, ValueError) as error:  # no permission, too long a name, a loop of links
+        return f"cannot be reached: {reason_of(error)}"
+    if stat.S_ISDIR(mode):
+        return "is a folder"
+    if not stat.S_ISREG(mode):
+        return "is no regular file"
+    return None if os.access(path, os.R_OK) else "cannot be read: permission denied"
+
+
+def reason_of(error):
+    """The reason of an OSError or another one in a few words."""
+    return getattr(error, "strerror", None) or " ".join(str(error).split())
 
 
 def check_writable(path):
@@ -16,13 +37,34 @@ def check_writable(path):
         raise SettingsError(
             f"output name '{path.name[:40]}…' is longer than the 255 bytes that file systems take"
         )
-    if path.is_dir():
-        raise SettingsError(f"output '{path}' is a folder: give a file name")
-    if not folder.is_dir():
+    try:
+        is_folder = stat.S_ISDIR(os.stat(folder).st_mode)
+    except (FileNotFoundError, NotADirectoryError):
+        is_folder = False
+    except (OSError, ValueError) as error:
+        raise SettingsError(
+            f"output folder '{folder}' cannot be reached: {reason_of(error)}"
+        ) from None
+    if not is_folder:
         raise SettingsError(f"output folder '{folder}' does not exist: create it first")
-    if path.exists() and not path.is_file():
+    _check_replaceable(path)
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise SettingsError(f"output '{path}' cannot be written: permission denied")
+
+
+def _check_replaceable(path):
+    """Raise SettingsError if something is at `path` that a file cannot take the place of."""
+    try:
+        mode = os.stat(path).st_mode
+    except FileNotFoundError:
+        return
+    except (OSError, ValueError) as error:
+        raise SettingsError(f"output '{path}' cannot be reached: {reason_of(error)}") from None
+    if stat.S_ISDIR(mode):
+        raise SettingsError(f"output '{path}' is a folder: give a file name")
+    if not stat.S_ISREG(mode):
         raise SettingsError(f"output '{path}' is no regular file: give another name")
-    if not os.access(folder, os.W_OK) or (path.exists() and not os.access(path, os.W_OK)):
+    if not os.access(path, os.W_OK):
         raise SettingsError(f"output '{path}' cannot be written: permission denied")
 
 
