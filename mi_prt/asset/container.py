@@ -154,6 +154,15 @@ def is_asset(path):
     return start[8:] == b"{" or start.startswith(_HDF5)
 
 
+def is_own(path):
+    """Whether a file is an asset of any version, and no safetensors file of another program."""
+    if not is_asset(path):
+        return False
+    with open(path, "rb") as file:
+        start = file.read(1 << 12)
+    return start.startswith(_HDF5) or f'"{FORMAT}"'.encode() in start
+
+
 @contextmanager
 def opened(path):
     """Within the block, the file at `path` as `Stored`; arrays taken from it stay usable after it.

@@ -14,6 +14,7 @@ from .options import (
     Define,
     Direct,
     Environment,
+    Force,
     Frames,
     FramesPerSecond,
     Json,
@@ -113,6 +114,7 @@ def precompute(
             "--max-memory", metavar="BYTES", help="Such as 3G; default: half of what is free."
         ),
     ] = None,
+    force: Force = False,
     threads: Threads = None,
     define: Define = None,
     as_json: Json = False,
@@ -138,6 +140,7 @@ def precompute(
             output,
             resume,
             max_memory,
+            force,
             **settings,
         )
     cost["seconds"]["total"] = round(time.perf_counter() - started, 4)
@@ -200,6 +203,7 @@ def relight(
     frames: Frames = None,
     fps: FramesPerSecond = None,
     scene: OtherScene = None,
+    force: Force = False,
     threads: Threads = None,
     as_json: Json = False,
 ):
@@ -223,6 +227,7 @@ def relight(
         "component": component,
         "direct": direct,
         "rotate": turned,
+        "force": force,
     }
     film = {k: v for k, v in (("frames", frames), ("fps", fps)) if v is not None}
     if light_path is not None:
@@ -267,6 +272,7 @@ def compare(
     direct: Direct = "points",
     scene: OtherScene = None,
     seed: Seed = 0,
+    force: Force = False,
     threads: Threads = None,
     as_json: Json = False,
 ):
@@ -291,6 +297,7 @@ def compare(
             progress=progress,
             nearest=nearest,
             direct=direct,
+            force=force,
         )
     _show(result if as_json else {"wrote": str(output / "index.html")} | result, as_json)
 

@@ -92,6 +92,9 @@ Frames = Annotated[
 FramesPerSecond = Annotated[
     int | None, typer.Option("--fps", metavar="N", help=f"Frames of the film in a second [{FPS}].")
 ]
+Force = Annotated[
+    bool, typer.Option("--force", help="Replace a file that was not written by mi-prt.")
+]
 Seed = Annotated[int, typer.Option("--seed", help="Same seed, same result.")]
 
 LIGHTS_HELP = "\n\n".join(

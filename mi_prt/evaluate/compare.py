@@ -18,12 +18,13 @@ from ..render.integrator import check_direct
 from ..render.picture import Picture
 from ..render.rendered import check_picture
 from ..scene.scene import Scene
+from ..system.files import check_own
 from ..transport.transport import Question
 from . import ground_truth
 from .local_lights import stand_in_error
 from .near_emitters import near_emitters
 from .norms import errors_at_points, image_errors
-from .report import write_report
+from .report import NAMES, is_report, write_report
 from .views import compared_points, first_hits, visible_weights
 
 REFERENCES = ("modelled", "full")
@@ -49,6 +50,7 @@ def compare(
     progress=lambda stage, done, total: None,
     nearest=1,
     direct="points",
+    force=False,
 ):
     """Compare an asset with Mitsuba and write the comparison to a folder.
 
@@ -77,6 +79,8 @@ def compare(
         Directions that stand for a local light, see `Asset.irradiance`.
     direct : 'points' or 'pixels'
         Where direct light of local lights is computed for the image.
+    force : bool
+        Whether to replace files in the folder that are of no report.
 
     Returns
     -------
@@ -106,7 +110,7 @@ def compare(
         raise SettingsError(
             f"spp {spp} is too low: the reference's noise is told from two halves, so at least 2"
         )
-    folder = _made_folder(folder)
+    folder = _made_folder(folder, force)
     opened = open_scene_of(asset, scene)
     resolved = asset.resolved(light, rotate, opened)
     as_written = reference == "full" and light is None and rotate is None
@@ -211,7 +215,7 @@ class _Points:
         }
 
 
-def _made_folder(folder):
+def _made_folder(folder, force):
     folder = Path(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -221,4 +225,6 @@ def _made_folder(folder):
         raise SettingsError(
             f"output folder '{folder}' cannot be written: {error.strerror}"
         ) from None
+    for name in NAMES:
+        check_own(folder / name, lambda _: is_report(folder), force)
     return folder

@@ -1,5 +1,6 @@
 """Light that moves along a path, and frames as a video file or numbered images."""
 
+import os
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -11,7 +12,7 @@ import numpy as np
 
 from ..errors import SettingsError
 from ..render.image_file import to_8bit, write_displayed
-from ..system.files import check_writable, replacing
+from ..system.files import MARK, check_own, check_writable, is_marked, replacing
 from ..system.whole import check_whole
 
 VIDEOS = (".mp4", ".gif")
@@ -120,8 +121,10 @@ def light_path(text):
     return LightPath(np.array(positions))
 
 
-def check_frames_output(output, fps=25):
-    """Raise SettingsError unless `write_frames` can write there."""
+def check_frames_output(output, fps=25, frames=1, force=False):
+    """Raise SettingsError unless `write_frames` can write so many frames there; and, without
+    `force`, if that would replace files of others.
+    """
     output = Path(output)
     suffix = output.suffix.lower()
     if suffix in VIDEOS:
@@ -130,6 +133,7 @@ def check_frames_output(output, fps=25):
                 f"fps of {suffix} must be above 0 and at most {MAX_FPS[suffix]}, got {fps}"
             )
         check_writable(output)
+        check_own(output, is_marked, force)
     elif suffix == ".png":
         if output.name.count("%") != 1 or not _NUMBER.search(output.name):
             raise SettingsError(
@@ -137,6 +141,8 @@ def check_frames_output(output, fps=25):
                 " 'frame-%03d.png'"
             )
         check_writable(_numbered(output, 0))
+        for number in range(frames):
+            check_own(_numbered(output, number), is_marked, force)
     else:
         raise SettingsError(
             f"output '{output}' must end in {', '.join(VIDEOS)}, or be numbered like"
@@ -173,7 +179,7 @@ def write_frames(output, frames: Iterable, fps=25):
     ----- H.264 needs an even width and height: the last row or column is repeated. A quarter of the
     resolution carries colour.
     """
-    check_frames_output(output, fps)
+    check_frames_output(output, fps, force=True)
     output, images = Path(output), _images(frames)
     if output.suffix.lower() == ".png":
         count = 0
@@ -213,6 +219,7 @@ def _write_mp4(path, images, fps):
     first = to_8bit(next(images))
     height, width = (side + side % 2 for side in first.shape[:2])
     with av.open(path, "w", format="mp4", options={"movflags": "+faststart"}) as file:
+        file.metadata["comment"] = MARK
         stream = file.add_stream("libx264", rate=fps, options={"crf": "18"})
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
         codec = stream.codec_context
@@ -232,7 +239,7 @@ def _write_mp4(path, images, fps):
             )
             file.mux(stream.encode(frame))
         file.mux(stream.encode())
-        return count
+    return count
 
 
 def _write_gif(path, images, fps):
@@ -265,4 +272,12 @@ def _write_gif(path, images, fps):
             graph.push(frame)
             file.mux(stream.encode(graph.pull()))  # pyright: ignore[reportArgumentType]
         file.mux(stream.encode())
-        return count
+    _mark_gif(path)
+    return count
+
+
+def _mark_gif(path):
+    """Add a comment, before the byte that ends a GIF."""
+    with open(path, "r+b") as file:
+        file.seek(-1, os.SEEK_END)
+        file.write(b"\x21\xfe" + bytes([len(MARK)]) + MARK.encode() + b"\0;")

@@ -33,6 +33,7 @@ def animate(
     direct="points",
     progress=lambda stage, done, total, detail="": None,
     rotate=None,
+    force=False,
 ):
     """Move the first local light along a path, and write a frame for each place of it.
 
@@ -45,7 +46,7 @@ def animate(
     frames, fps : int
     light : what `as_light` accepts, or a list of such
         Whose first point, spot or area light moves; all else stays.
-    scene, sensor, size, renderer, spp, component, direct, rotate :
+    scene, sensor, size, renderer, spp, component, direct, rotate, force :
         As of `relight_to_file`.
     progress : callable(stage, done, total, detail)
 
@@ -59,7 +60,7 @@ def animate(
     check_direct(direct)
     Question(Light(()), component)  # which checks it
     places = path.positions(frames)
-    check_frames_output(output, fps)
+    check_frames_output(output, fps, frames, force)
     opened = open_scene_of(asset, scene)
     moving = _Moving(asset.resolved(light, rotate, opened))
     first = moving.at(places[0])

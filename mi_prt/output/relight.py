@@ -10,7 +10,7 @@ from ..render.display import exposure
 from ..render.integrator import check_direct
 from ..render.picture import RENDERERS, Picture
 from ..render.rendered import check_picture
-from ..system.files import check_writable
+from ..system.files import check_own, check_writable
 from ..transport.transport import Question
 from .formats import FORMATS, Relit, format_of
 
@@ -28,6 +28,7 @@ def relight_to_file(
     nearest=1,
     component="total",
     direct="points",
+    force=False,
 ):
     """Relight an asset and write the result.
 
@@ -56,6 +57,8 @@ def relight_to_file(
     direct : 'points' or 'pixels'
         Where direct light of local lights is computed: at the points, or with shadow rays at each
         pixel.
+    force : bool
+        Whether to replace a file that this program has not written.
 
     Returns
     -------
@@ -85,6 +88,7 @@ def relight_to_file(
             " or leave direct (--direct) at points"
         )
     check_writable(output)
+    check_own(output, written.is_own, force)
     opened = open_scene_of(asset, scene) if written.is_picture else None
     resolved = asset.resolved(light, rotate, opened or scene)
     clock = [time.perf_counter()]

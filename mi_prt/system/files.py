@@ -8,6 +8,9 @@ from pathlib import Path
 
 from ..errors import SettingsError
 
+MARK = "written by mi_prt"  # in every picture, film, mesh and archive
+_MARKED = 1 << 16
+
 
 def why_no_file(path):
     """Why a path leads to no regular file that can be read, in words; None if it does."""
@@ -66,6 +69,37 @@ def _check_replaceable(path):
         raise SettingsError(f"output '{path}' is no regular file: give another name")
     if not os.access(path, os.W_OK):
         raise SettingsError(f"output '{path}' cannot be written: permission denied")
+
+
+def check_own(path, is_own, force=False):
+    """Raise SettingsError if a file is at `path` that this program has not written.
+
+    Parameters
+    ----------
+    path : path
+    is_own : callable(path)
+        Whether a file is one that this program writes under such a name. Empty ones are free to
+        take.
+    force : bool
+        Whether it may be replaced all the same.
+    """
+    if force or not os.path.exists(path) or not os.path.getsize(path) or is_own(path):
+        return
+    raise SettingsError(
+        f"output '{path}' is there and was not written by mi_prt: give another name, or replace it"
+        " (--force)"
+    )
+
+
+def is_marked(path):
+    """Whether a file holds `MARK` in its first or last 64 KB."""
+    try:
+        with open(path, "rb") as file:
+            start = file.read(_MARKED)
+            file.seek(-min(_MARKED, os.fstat(file.fileno()).st_size), os.SEEK_END)
+            return MARK.encode() in start or MARK.encode() in file.read()
+    except OSError:
+        return False
 
 
 @contextmanager
