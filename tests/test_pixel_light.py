@@ -230,5 +230,7 @@ def test_footprints_of_rays_grow_with_distance_and_at_grazing_incidence():
     cosine = toward[:, 1] / distance
     expected = np.pi * distance**2 / (np.maximum(cosine, LEAST_COSINE) * rays)
     assert (cosine < LEAST_COSINE).any() and np.median(cosine) > 0.5 and len(cosine) > 500
-    np.testing.assert_allclose(footprint[on_roof], expected, rtol=0.02)  # rays begin a little inward
+    np.testing.assert_allclose(
+        footprint[on_roof], expected, rtol=0.02
+    )  # rays begin a little inward
     assert LEAST_COSINE <= 0.1  # else many rays of a hemisphere would have another footprint

@@ -149,7 +149,7 @@ def compare(
         "transports": {kind: t.summary() for kind, t in asset.transports.items()},
         # reflections that were not asked for are missing in the truth as well
         "ledger": [e.as_dict() for e in asset.ledger() if bounces is None or e.knob != "bounces"],
-        **stand_in_error(asset, resolved, nearest, lambda: opened, seed),
+        **stand_in_error(asset, resolved, nearest, opened, seed),
         "points": {"count": len(points.index)} | points.errors(irradiance),
         "components": points.component_errors(picture),
         "image": image_errors(result, expected, hits.covered, hits.emits),

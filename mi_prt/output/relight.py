@@ -1,10 +1,11 @@
 """From an asset and light to a file: image, mesh with vertex radiance, or plain arrays."""
 
 import time
+import warnings
 
 from ..asset.provenance import open_scene_of
 from ..errors import SettingsError
-from ..evaluate.local_lights import stand_in_error
+from ..lighting.environment import LightWarning
 from ..lighting.light import Light
 from ..render.display import exposure
 from ..render.integrator import check_direct
@@ -63,9 +64,7 @@ def relight_to_file(
     Returns
     -------
     dict
-        points, seconds{relight, render}. Where transport of distant light stands in for local
-        lights, and the scene is at hand, also local_light_error{relative_rmse, bias, points}, the
-        error of their irradiance against Mitsuba's.
+        points, seconds{relight, render}.
 
     Raises
     ------
@@ -75,7 +74,7 @@ def relight_to_file(
     -----
     LightWarning
         If a local light is inside the convex hull of the scene and only transport of distant light
-        is there for it; with the measured error.
+        is there for it. `compare` measures its error.
     """
     written = format_of(output)
     RENDERERS[renderer]
@@ -108,14 +107,10 @@ def relight_to_file(
     written.write(output, relit)
     clock.append(time.perf_counter())
     seconds = zip(("relight", "render"), clock, clock[1:])
-    result = {
+    for warning in asset.warnings(asset.shared_out(resolved)):
+        text = f"{warning}; compare tells how far such light is off (mi-prt compare)"
+        warnings.warn(text, LightWarning, stacklevel=2)
+    return {
         "points": len(asset.points),
         "seconds": {name: round(b - a, 5) for name, a, b in seconds},
     }
-
-    def at_hand():
-        """The scene where it is open already, or worth opening."""
-        wanted = asset.warnings(asset.shared_out(resolved))
-        return opened or (open_scene_of(asset, scene) if wanted else None)
-
-    return result | stand_in_error(asset, resolved, nearest, at_hand)
