@@ -6,6 +6,7 @@
 import numpy as np
 
 from ..basis.transport_rows import DirectTransport
+from ..system.arrays import packets
 from ..system.runtime import mitsuba
 
 LANES = 1 << 22  # rays of a wavefront: a few million keep both cores busy in a few hundred MB
@@ -81,7 +82,6 @@ class VisibilityTracer:
     """
 
     def __init__(self, scene, points, vectors):
-        mi = mitsuba()
         self.occluders = scene.occluders
         self.lanes_per_point = len(vectors)
         # Rays start on the side of the surface that reflects, and off its rim. One that dips below
@@ -89,7 +89,7 @@ class VisibilityTracer:
         # blocked, as it is in Mitsuba's own rendering.
         origins = points.ray_origins(RAY_OFFSET * scene.scale)
         self._vectors, self._origins, self._normals = (
-            mi.Float(np.pad(x, ((0, 0), (0, 1))).ravel())  # 4 floats each: gathered in one load
+            packets(np.pad(x, ((0, 0), (0, 1))))  # 4 floats each: gathered in one load
             for x in (vectors, origins, points.normals)
         )
 
@@ -104,10 +104,10 @@ class VisibilityTracer:
             return mi.Vector3f(v.x, v.y, v.z)
 
         lane = dr.arange(mi.UInt32, size * self.lanes_per_point)
-        # the divisor is the same in all blocks, so it may be a literal
-        local = lane // self.lanes_per_point
+        per_point = dr.opaque(mi.UInt32, self.lanes_per_point)
+        local = lane // per_point
         point = local + dr.opaque(mi.UInt32, first)
-        direction = vectors(self._vectors, lane - local * self.lanes_per_point)
+        direction = vectors(self._vectors, lane - local * per_point)
         above = dr.mulsign(direction, dr.dot(vectors(self._normals, point), direction))
         return mi.Ray3f(vectors(self._origins, point), above)
 
@@ -171,14 +171,18 @@ def find_buried(scene, points, dark=None, lanes=LANES):
     vectors = np.stack(
         [np.sqrt(1 - z * z) * np.cos(phi), np.sqrt(1 - z * z) * np.sin(phi), z], axis=-1
     ).astype(np.float32)
-    step = max(1, lanes // BURIED_RAYS)
+    step, near = max(1, lanes // BURIED_RAYS), dr.opaque(mi.Float, 1e-3 * scene.scale)
     for chunk in np.split(index, range(step, len(index), step)):
         normals = np.repeat(points.normals[chunk], BURIED_RAYS, axis=0)
         toward = np.tile(vectors, (len(chunk), 1))
         toward *= np.where(np.sum(toward * normals, axis=1) < 0, -1, 1)[:, None].astype(np.float32)
         origins = points.at(chunk).ray_origins(RAY_OFFSET * scene.scale)
-        ray = mi.Ray3f(mi.Point3f(np.repeat(origins, BURIED_RAYS, axis=0).T), mi.Vector3f(toward.T))
+        lane = dr.arange(mi.UInt32, len(toward))  # gathered: arrays read lane by lane compile anew
+        ray = mi.Ray3f(
+            dr.gather(mi.Point3f, mi.Float(origins.ravel()), lane // BURIED_RAYS),
+            dr.gather(mi.Vector3f, mi.Float(toward.ravel()), lane),
+        )
         hit = scene.occluders.ray_intersect(ray)
-        inside = hit.is_valid() & ((dr.dot(hit.n, ray.d) > 0) | (hit.t < 1e-3 * scene.scale))
+        inside = hit.is_valid() & ((dr.dot(hit.n, ray.d) > 0) | (hit.t < near))
         buried[chunk] = np.array(inside).reshape(len(chunk), BURIED_RAYS).all(axis=1)
     return buried
