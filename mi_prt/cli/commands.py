@@ -26,6 +26,7 @@ from .options import (
     Sensor,
     Size,
     Threads,
+    Variant,
     flowing,
     with_settings,
 )
@@ -72,6 +73,7 @@ def info(
     path: Annotated[Path, typer.Argument(help="A scene (XML) or an asset.")],
     settings: dict,
     define: Define = None,
+    variant: Variant = None,
     as_json: Json = False,
 ):
     """Say what a scene requires and what precomputing it will cost, or what an asset holds."""
@@ -80,6 +82,7 @@ def info(
     from ..asset.describe import describe_asset
     from ..precompute.forecast import describe
 
+    take.use(None, variant)
     if is_asset(path):
         found = describe_asset(load(path))
     else:
@@ -116,6 +119,7 @@ def precompute(
     ] = None,
     force: Force = False,
     threads: Threads = None,
+    variant: Variant = None,
     define: Define = None,
     as_json: Json = False,
 ):
@@ -130,7 +134,7 @@ def precompute(
     from ..system.files import check_writable
 
     check_writable(output)
-    take.set_threads(threads)
+    take.use(threads, variant)
     started = time.perf_counter()
     with progress_bar(kept=f"{output}.partial") as progress:
         asset, cost = measure(
@@ -205,6 +209,7 @@ def relight(
     scene: OtherScene = None,
     force: Force = False,
     threads: Threads = None,
+    variant: Variant = None,
     as_json: Json = False,
 ):
     """Relight an asset: an image, a mesh with vertex radiance, plain arrays, or a film of a light
@@ -215,7 +220,7 @@ def relight(
     from ..output.moving import animate
     from ..output.relight import relight_to_file
 
-    take.set_threads(threads)
+    take.use(threads, variant)
     chosen, turned = take.light_of(envmap, light), take.rotation_of(rotate)
     asset = load(asset_path)
     shown = {
@@ -274,13 +279,14 @@ def compare(
     seed: Seed = 0,
     force: Force = False,
     threads: Threads = None,
+    variant: Variant = None,
     as_json: Json = False,
 ):
     """Compare an asset with Mitsuba's ground truth and write a report with pictures."""
     from ..asset.asset import load
     from ..evaluate.compare import compare as run
 
-    take.set_threads(threads)
+    take.use(threads, variant)
     asset = load(asset_path)
     with progress_bar() as progress:
         result = run(

@@ -35,7 +35,7 @@ hit = scene.ray_intersect(mi.Ray3f([0, 0, 5], [0, 0, -1]))
 mi.render(scene, spp=1).numpy()
 print(json.dumps({"variant": mi.variant(), "distance": float(hit.t[0]),
                   "threads": runtime.thread_count(), "embree": bool(mi.MI_ENABLE_EMBREE),
-                  "gpu": bool(dr.has_backend(dr.JitBackend.CUDA)),
+                  "gpu": bool(dr.has_backend(dr.JitBackend.CUDA)), "optix": runtime.cuda_usable(),
                   "llvm": runtime.versions()["llvm"]}))
 """
 
@@ -258,13 +258,13 @@ def _embree(rays: dict) -> Check:
 
 
 def _cuda(rays: dict) -> Check:
-    if rays["variant"].startswith("cuda"):
-        return Check("cuda", "ok", "used")
-    if rays["gpu"]:
-        return Check(
-            "cuda",
-            "warning",
-            "a GPU, but its driver's OptiX (libnvoptix.so.1) is missing, so LLVM is used",
-            "install the complete driver; in a container set NVIDIA_DRIVER_CAPABILITIES=all",
-        )
-    return Check("cuda", "ok", "no GPU, LLVM is used")
+    if not rays["gpu"]:
+        return Check("cuda", "ok", "no GPU, LLVM is used")
+    if rays["optix"]:
+        return Check("cuda", "ok", "a GPU, used where it is asked for (--variant cuda_ad_rgb)")
+    return Check(
+        "cuda",
+        "warning",
+        "a GPU, but its driver's OptiX (libnvoptix.so.1) is missing, so only LLVM can be used",
+        "install the complete driver; in a container set NVIDIA_DRIVER_CAPABILITIES=all",
+    )

@@ -21,8 +21,8 @@ from types import ModuleType
 from ..errors import RuntimeSetupError, SettingsError
 from .llvm import install_command, require_llvm, select_llvm
 
-VARIANTS = ("cuda_ad_rgb", "llvm_ad_rgb")
-"""Mitsuba variants that mi_prt works in, the preferred one first."""
+VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")
+"""Mitsuba variants that mi_prt works in, the default first; see docs/cuda.md for the other."""
 
 THREADS_PER_CORE = 8
 """Most threads per core that `set_threads` accepts: more only costs memory."""
@@ -51,8 +51,8 @@ _RASTER_PACKAGES = {
 def mitsuba() -> ModuleType:
     """The `mitsuba` module with a usable variant set.
 
-    A variant of `VARIANTS` that is already set is kept. Without one, `cuda_ad_rgb` is set where
-    Dr.Jit finds a GPU and OptiX, else `llvm_ad_rgb`.
+    A variant of `VARIANTS` that is already set is kept; without one `llvm_ad_rgb` is set, also
+    where there is a GPU.
 
     Raises
     ------
@@ -63,7 +63,7 @@ def mitsuba() -> ModuleType:
     mi = _load("mitsuba")
     variant = mi.variant()
     if variant is None:
-        variant = "cuda_ad_rgb" if cuda_usable() else "llvm_ad_rgb"
+        variant = VARIANTS[0]
     if variant not in VARIANTS:
         raise RuntimeSetupError(
             f"the Mitsuba variant {variant} is set, but mi_prt works in {' or '.join(VARIANTS)}; "
@@ -74,6 +74,28 @@ def mitsuba() -> ModuleType:
     if mi.variant() is None:
         mi.set_variant(variant)
     return mi
+
+
+def set_variant(variant: str) -> None:
+    """Set the variant that Mitsuba works in from here on.
+
+    Raises
+    ------
+    SettingsError
+        If it is not one of `VARIANTS`.
+    RuntimeSetupError
+        If this machine lacks what it needs.
+    """
+    if variant not in VARIANTS:
+        raise SettingsError(f"variant '{variant}' is not known: use {' or '.join(VARIANTS)}")
+    if variant.startswith("cuda") and not cuda_usable():
+        raise RuntimeSetupError(
+            f"the variant {variant} needs a GPU of NVIDIA, its driver and OptiX, one of which is"
+            f" not found here: install them, or use {VARIANTS[0]}"
+        )
+    if variant.startswith("llvm"):
+        require_llvm()
+    _load("mitsuba").set_variant(variant)
 
 
 def cuda_usable() -> bool:
