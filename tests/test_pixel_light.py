@@ -13,6 +13,7 @@ from mi_prt.evaluate import ground_truth
 from mi_prt.points.points import sample_points
 from mi_prt.render.direct_light import LocalEmitters
 from mi_prt.render.image import render_image
+from mi_prt.render.integrator import integrator_for
 from mi_prt.scene.scene import open_scene
 from mi_prt.system.runtime import mitsuba
 from mi_prt.transport.bits import find_buried
@@ -200,6 +201,30 @@ def test_an_image_with_light_at_pixels_only():
     assert 0.05 < (expected == 0).all(axis=2).mean() < 0.95
     assert relative_l2(image, expected) < 0.03
     assert abs(bias(image, expected)) < 0.005
+
+
+def test_the_plugin_takes_the_lamps_of_each_scene_that_it_renders():
+    """One integrator, two scenes of one geometry with lamps in other places and of another number:
+    the second image is that of an integrator of its own.
+    """
+    import mi_prt
+
+    mi = mitsuba()
+    look = mi.ScalarTransform4f().look_at([0, 3, 0.1], [0, 0, 0], [0, 1, 0])
+    film = {"type": "hdrfilm", "width": 8, "height": 6, "rfilter": {"type": "box"}}
+    camera = {"type": "perspective", "to_world": look, "film": film}
+    lamps = {"one": bulb((-0.5, 1, 0))}, {"one": bulb((0.5, 1, 0)), "two": bulb((0, 0.5, 0.3))}
+    asset = mi_prt.precompute(
+        scene(floor=floor(), **lamps[0]), transports="own", edge_length=1.0, bounces=0
+    )
+    dark = np.zeros((len(asset.points), 3), np.float32)
+    first, second = (mi.load_dict(scene(floor=floor(), camera=camera, **x)) for x in lamps)
+    shared = integrator_for(asset, dark, "pixels")
+    mi.render(first, integrator=shared, spp=1)
+    found = np.array(mi.render(second, integrator=shared, spp=4))
+    own = np.array(mi.render(second, integrator=integrator_for(asset, dark, "pixels"), spp=4))
+    assert own.max() > 0
+    np.testing.assert_array_equal(found, own)
 
 
 def test_footprints_of_rays_grow_with_distance_and_at_grazing_incidence():

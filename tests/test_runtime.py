@@ -14,7 +14,7 @@ import time
 import pytest
 
 from mi_prt.errors import RuntimeSetupError, SettingsError
-from mi_prt.system import doctor, llvm, runtime
+from mi_prt.system import doctor, llvm, opengl, runtime
 
 linux_only = pytest.mark.skipif(sys.platform != "linux", reason="the linker and /proc are Linux's")
 
@@ -287,21 +287,21 @@ def test_versions_name_all_that_a_result_depends_on():
 def test_platform_that_needs_a_screen_is_refused(monkeypatch, name):
     monkeypatch.setenv("PYOPENGL_PLATFORM", name)
     with pytest.raises(RuntimeSetupError, match=name):
-        runtime.raster_platform()
+        opengl.raster_platform()
 
 
 def test_missing_platforms_are_named_with_a_remedy(monkeypatch):
     monkeypatch.delenv("PYOPENGL_PLATFORM", raising=False)
-    monkeypatch.setattr(runtime, "_installed", lambda name: False)
+    monkeypatch.setattr(opengl, "_installed", lambda name: False)
     with pytest.raises(RuntimeSetupError, match="neither OSMesa nor EGL.*install"):
-        runtime.raster_platform()
+        opengl.raster_platform()
 
 
 def test_opengl_imported_before_for_a_screen_is_told_apart():
     run = run_python(
         "import os; os.environ['PYOPENGL_PLATFORM'] = 'glx'; import OpenGL.platform\n"
         "del os.environ['PYOPENGL_PLATFORM']\n"
-        "from mi_prt.system.runtime import raster_platform; raster_platform()"
+        "from mi_prt.system.opengl import raster_platform; raster_platform()"
     )
     assert "PyOpenGL was imported before mi_prt and took GLXPlatform" in run.stderr
 

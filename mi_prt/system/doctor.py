@@ -16,7 +16,7 @@ from pathlib import Path
 
 from packaging.requirements import Requirement
 
-from . import llvm, runtime
+from . import llvm, opengl, runtime
 
 TIME_LIMIT = 120
 """Seconds after which a probe counts as failed."""
@@ -41,15 +41,15 @@ print(json.dumps({"variant": mi.variant(), "distance": float(hit.t[0]),
 
 _RASTER_PROBE = """
 import json
-from mi_prt.system import runtime
-pyrender = runtime.pyrender()
+from mi_prt.system import opengl
+pyrender = opengl.pyrender()
 renderer = pyrender.OffscreenRenderer(16, 16)
 from OpenGL.GL import GL_RENDERER, glGetString
 driver = glGetString(GL_RENDERER).decode()
 scene = pyrender.Scene(bg_color=[1.0, 1.0, 1.0, 1.0])
 scene.add(pyrender.PerspectiveCamera(yfov=1.0))
 color, _ = renderer.render(scene)
-print(json.dumps({"platform": runtime.raster_platform(), "driver": driver,
+print(json.dumps({"platform": opengl.raster_platform(), "driver": driver,
                   "background": int(color.min())}))
 """
 
@@ -110,7 +110,7 @@ def check_raster() -> Check:
         return _fault(
             "raster",
             complaint,
-            f"install a software renderer: `{runtime.raster_install_command()}`",
+            f"install a software renderer: `{opengl.raster_install_command()}`",
         )
     value = f"{found['platform']}: {found['driver']}"
     if found["background"] != 255:
