@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import OpenEXR
-import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 SCENE = """<scene version="3.0.0">
@@ -31,12 +30,10 @@ import mi_prt
 from mi_prt.cli import main
 from mi_prt.system.runtime import mitsuba, set_threads, thread_count
 
-if sys.argv[1] == "option":
-    common = ["--threads", "1"]
-else:
-    common = []
+common = ["--threads", "1"]
+if hasattr(os, "sched_setaffinity"):
     os.sched_setaffinity(0, [0])
-    set_threads(1)  # what Dr.Jit takes of one core
+set_threads(1)  # what Dr.Jit takes of one core
 
 
 def run(*arguments):
@@ -59,19 +56,16 @@ print("threads", thread_count())
 """
 
 
-@pytest.mark.parametrize("how", ["option", "core"])
-def test_images_with_a_single_thread(how, tmp_path):
+def test_images_with_a_single_thread(tmp_path):
     """Scene with .exr textures, .exr output, `compare`, maps, also an .exr under another name; by
-    `--threads 1`, and as on one core. One thread it is before and after.
+    `--threads 1`, and on one core. One thread it is before and after.
     """
-    if how == "core" and not hasattr(os, "sched_setaffinity"):
-        pytest.skip("no choice of cores here")
     (tmp_path / "scene.xml").write_text(SCENE)
     for name in ("sky.exr", "floor.exr"):
         OpenEXR.File({}, {"RGB": np.full((40, 80, 3), 0.5, np.float32)}).write(str(tmp_path / name))
     (tmp_path / "misnamed.hdr").write_bytes((tmp_path / "sky.exr").read_bytes())
     done = subprocess.run(
-        [sys.executable, "-c", PROGRAM, how],
+        [sys.executable, "-c", PROGRAM],
         cwd=tmp_path,
         env=os.environ | {"PYTHONPATH": str(ROOT)},
         capture_output=True,
