@@ -10,6 +10,10 @@ Importing this package chooses the LLVM that Dr.Jit will load and registers the 
 `prt` with Mitsuba.
 """
 
+from .system.starting import end_quietly_when_interrupted
+
+end_quietly_when_interrupted()  # in the program alone, until its main() takes over
+
 from .system.llvm import select_llvm
 
 select_llvm()  # before anything can load Dr.Jit: an LLVM that is too old would end the process

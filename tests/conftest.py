@@ -5,6 +5,7 @@ Scenes are y-up, lengths in metres.
 
 import gc
 import importlib
+import os
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,11 +17,25 @@ from threadpoolctl import threadpool_limits
 from mi_prt.directions import parse_directions
 from mi_prt.points.points import sample_points
 from mi_prt.scene.scene import open_scene
-from mi_prt.system.runtime import mitsuba
+from mi_prt.system.runtime import VARIANTS, mitsuba, set_variant
 from mi_prt.transport.bits import find_buried, sample_direct
 from mi_prt.transport.hops import NOTHING, Hops, HopSampler, blocked_share
 from mi_prt.transport.interreflection import solve, split_by_bounces
 from mi_prt.transport.paths import PathSampler
+
+
+def pytest_addoption(parser):
+    parser.addoption(
+        "--variant",
+        default=os.environ.get("MI_PRT_TEST_VARIANT", VARIANTS[0]),
+        choices=VARIANTS,
+        help="Mitsuba's variant that the tests run in, also of MI_PRT_TEST_VARIANT",
+    )
+
+
+def pytest_configure(config):
+    """Before any test file is imported: several make scenes while they are."""
+    set_variant(config.getoption("--variant"))
 
 
 def pytest_collection_finish():

@@ -627,7 +627,7 @@ def test_a_failing_write_leaves_the_old_file(asset, tmp_path, monkeypatch, error
 
     monkeypatch.setattr(container, "is_finite", fail)
     with pytest.raises(SettingsError if isinstance(error, OSError) else KeyboardInterrupt):
-        asset.save(path)
+        asset.save(path, force=True)
     assert path.read_bytes() == b"old" and os.listdir(tmp_path) == ["old.prt"]
 
 

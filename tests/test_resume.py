@@ -388,8 +388,10 @@ def test_a_folder_that_was_replaced_while_it_was_locked(tmp_path, monkeypatch):
 def test_the_scene_is_not_overwritten(tmp_path):
     path = tmp_path / "scene.xml"
     path.write_text("<scene version='3.0.0'><shape type='sphere'/></scene>")
-    with pytest.raises(SettingsError, match="the scene itself"):
+    with pytest.raises(SettingsError, match="was not written by mi_prt"):
         mi_prt.precompute(path, output=path)
+    with pytest.raises(SettingsError, match="the scene itself"):
+        mi_prt.precompute(path, output=path, force=True)
     assert "sphere" in path.read_text() and os.listdir(tmp_path) == ["scene.xml"]
 
 

@@ -14,7 +14,7 @@ import time
 import pytest
 
 from mi_prt.errors import RuntimeSetupError, SettingsError
-from mi_prt.system import doctor, llvm, runtime
+from mi_prt.system import doctor, llvm, opengl, runtime
 
 linux_only = pytest.mark.skipif(sys.platform != "linux", reason="the linker and /proc are Linux's")
 
@@ -170,6 +170,37 @@ def test_another_variant_is_refused_by_name():
     assert "scalar_rgb" in message and "llvm_ad_rgb" in message and "cuda_ad_rgb" in message
 
 
+def test_llvm_is_the_default_whatever_there_is():
+    """Also where a GPU can be used, as this program is told here; another variant is asked for."""
+    run = run_python(
+        "from mi_prt.system import runtime\nruntime.cuda_usable = lambda: True\n"
+        "print(runtime.mitsuba().variant())",
+        **_usable_llvm(),
+    )
+    assert run.stdout == "llvm_ad_rgb\n", run.stderr
+
+
+def test_a_variant_that_cannot_be_had_is_refused(monkeypatch):
+    monkeypatch.setattr(runtime, "cuda_usable", lambda: False)
+    with pytest.raises(RuntimeSetupError, match="cuda_ad_rgb needs a GPU .* use llvm_ad_rgb"):
+        runtime.set_variant("cuda_ad_rgb")
+    with pytest.raises(SettingsError, match="'scalar_rgb' is not known: use llvm_ad_rgb or"):
+        runtime.set_variant("scalar_rgb")
+
+
+def test_a_variant_on_the_command_line(capsys):
+    """Each command that computes takes it, before anything is opened."""
+    from mi_prt.cli import main
+
+    for command in ("info", "precompute", "relight", "compare"):
+        output = [] if command == "info" else ["-o", "none/x.npz"]
+        with pytest.raises(SystemExit) as exit:
+            main([command, "none.xml", *output, "--variant", "metal"])
+        assert exit.value.code == 2
+        if command != "precompute":  # which looks at its output first
+            assert "variant 'metal' is not known" in capsys.readouterr().err
+
+
 def test_a_usable_variant_is_kept_and_messages_go_to_stderr():
     """A result on stdout is parsed by programs, so not one message of Mitsuba may appear there."""
     run = run_python(
@@ -256,21 +287,21 @@ def test_versions_name_all_that_a_result_depends_on():
 def test_platform_that_needs_a_screen_is_refused(monkeypatch, name):
     monkeypatch.setenv("PYOPENGL_PLATFORM", name)
     with pytest.raises(RuntimeSetupError, match=name):
-        runtime.raster_platform()
+        opengl.raster_platform()
 
 
 def test_missing_platforms_are_named_with_a_remedy(monkeypatch):
     monkeypatch.delenv("PYOPENGL_PLATFORM", raising=False)
-    monkeypatch.setattr(runtime, "_installed", lambda name: False)
+    monkeypatch.setattr(opengl, "_installed", lambda name: False)
     with pytest.raises(RuntimeSetupError, match="neither OSMesa nor EGL.*install"):
-        runtime.raster_platform()
+        opengl.raster_platform()
 
 
 def test_opengl_imported_before_for_a_screen_is_told_apart():
     run = run_python(
         "import os; os.environ['PYOPENGL_PLATFORM'] = 'glx'; import OpenGL.platform\n"
         "del os.environ['PYOPENGL_PLATFORM']\n"
-        "from mi_prt.system.runtime import raster_platform; raster_platform()"
+        "from mi_prt.system.opengl import raster_platform; raster_platform()"
     )
     assert "PyOpenGL was imported before mi_prt and took GLXPlatform" in run.stderr
 

@@ -13,8 +13,6 @@ from PIL import Image
 
 import mi_prt  # noqa: F401  (selects LLVM for Mitsuba)
 
-mi.set_variant("llvm_ad_rgb")
-
 SCENES = Path(__file__).resolve().parents[1] / "scenes"
 _spec = importlib.util.spec_from_file_location("scenes_generate", SCENES / "generate.py")
 generate = importlib.util.module_from_spec(_spec)

@@ -322,7 +322,7 @@ class Asset:
 
     # --- file ---------------------------------------------------------------------------------
 
-    def save(self, path, folder=None):
+    def save(self, path, folder=None, force=False):
         """Write the asset to one file, all or nothing.
 
         Parameters
@@ -331,13 +331,15 @@ class Asset:
         folder : path, optional
             Where the file is until it is whole: on the same file system, by default in the folder
             of `path`.
+        force : bool
+            Whether to replace a file that is no asset.
 
         Raises
         ------
         SettingsError
             If the path cannot be written.
         """
-        file.write(self, path, folder)
+        file.write(self, path, folder, force)
         object.__setattr__(self, "path", Path(path).absolute())
 
 

@@ -21,7 +21,7 @@ import numpy as np
 
 from ..errors import AssetError, SettingsError
 from ..system import plain_json
-from ..system.files import replacing
+from ..system.files import reason_of, replacing
 from ..system.schema import is_finite
 
 FORMAT = "mi_prt asset"
@@ -149,9 +149,18 @@ def is_asset(path):
             return False
         with open(path, "rb") as file:
             start = file.read(9)
-    except OSError:
+    except (OSError, ValueError):
         return False
     return start[8:] == b"{" or start.startswith(_HDF5)
+
+
+def is_own(path):
+    """Whether a file is an asset of any version, and no safetensors file of another program."""
+    if not is_asset(path):
+        return False
+    with open(path, "rb") as file:
+        start = file.read(1 << 12)
+    return start.startswith(_HDF5) or f'"{FORMAT}"'.encode() in start
 
 
 @contextmanager
@@ -171,7 +180,7 @@ def opened(path):
         try:
             stored = Stored(path, *_mapped(path))
         except OSError as error:
-            raise AssetError(f"asset '{path}' cannot be read: {error.strerror}") from None
+            raise AssetError(f"asset '{path}' cannot be read: {reason_of(error)}") from None
         yield stored
     except ValueError as error:
         if isinstance(error, AssetError):

@@ -8,6 +8,7 @@ from typing import Any
 from ..errors import AssetError, SettingsError
 from ..points.layout import LAYOUTS
 from ..points.points import Points
+from ..system.files import check_own, check_writable
 from ..system.schema import (
     Anything,
     Flag,
@@ -56,7 +57,7 @@ _HEADER = Record(
 )
 
 
-def write(asset, path, folder=None):
+def write(asset, path, folder=None, force=False):
     """Write an `Asset` to one file, all or nothing.
 
     Parameters
@@ -65,12 +66,16 @@ def write(asset, path, folder=None):
     path : path
     folder : path, optional
         Where the file is until it is whole, see `replacing`.
+    force : bool
+        Whether to replace a file that is no asset.
 
     Raises
     ------
     SettingsError
         If the path cannot be written, for example because the disk is full.
     """
+    check_writable(path)
+    check_own(path, container.is_own, force)
     points = asset.points
     scene = asset.scene | {"path": path_in_file(asset.scene, path)}
     header = {name: getattr(asset, name) for name in _TEXTS} | {

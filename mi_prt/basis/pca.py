@@ -21,9 +21,10 @@ import numpy as np
 import scipy.linalg
 
 from ..system.parallel import map_chunks, one_blas_thread
+from ..system.runtime import thread_count
 from .basis import BASES, compute_anew
 from .linear import LinearBasis
-from .rows import Rows
+from .rows import CHUNKS, Rows
 from .target import Fit, Target, check_room
 
 OVERSAMPLING = 16
@@ -39,15 +40,15 @@ MARGIN = 1.1  # above what that search expects to need
 # subspace, for each element of a row, for each product of the Gram matrix, and for each s³ of its
 # decomposition.
 ITERATION_COST, ROW_COST, GRAM_COST, DECOMPOSITION_COST = 1.3e-10, 4e-9, 2e-11, 6e-11
-# for each entry of a Gram matrix: the sum, parts of it that some threads have ready, the
-# decomposition
+GRAM_PARTS = 2  # parts of a Gram matrix that there are at a time, on any number of threads
+# for each entry of a Gram matrix: the sum, these parts, the decomposition
 GRAM_BYTES = 40
 GRAM_ROWS = 1024  # rows of one product: fewer would pass over the Gram matrix too often
 NEGLIGIBLE = 0.5  # seconds that exactness is worth
 MOST_GRAM_BYTES = 1 << 29  # a larger Gram matrix is no choice, only where there is no other
 # for each direction and column of the subspace: sums of some threads in float64, and the
 # orthonormalization
-ITERATION_BYTES = 110
+ITERATION_BYTES, SUM_BYTES = 94, 8  # the latter for each thread
 
 
 @BASES.register
@@ -178,7 +179,8 @@ def _plan(n, s, components):
     subspace = _subspace(components)
     side = min(n, s)
     gram_bytes = GRAM_BYTES * side**2 + (16 * n * s if n < s else 0)
-    iteration_bytes = ITERATION_BYTES * s * subspace
+    sums = SUM_BYTES * min(CHUNKS, thread_count())
+    iteration_bytes = (ITERATION_BYTES + sums) * s * subspace
     iteration = n * s * (subspace * ITERATION_COST + ROW_COST)
     gram = n * s * side * GRAM_COST + side**3 * DECOMPOSITION_COST
     # Subspaces that together reach a large part of the space are no smaller problem than the whole.
@@ -293,7 +295,8 @@ def _exact(rows, mean, components, progress):
 
     if s <= n:
         gram = np.zeros((s, s))
-        for part in reported(map_chunks(lambda chunk: (block := centred(chunk)).T @ block, chunks)):
+        products = map_chunks(lambda chunk: (block := centred(chunk)).T @ block, chunks, GRAM_PARTS)
+        for part in reported(products):
             gram += part
         with one_blas_thread():
             values, vectors = scipy.linalg.eigh(gram, subset_by_index=keep, overwrite_a=True)

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..directions.lattice import DirectionLattice
 from ..system.parallel import BLOCK_ROWS, map_chunks
+from ..system.runtime import thread_count
 
 # parts that the rows are split into for the threads; fixed, so that sums do not depend on their
 # number
@@ -57,7 +58,7 @@ class Rows:
         order, so that results are too.
         """
         index = self.index if index is None else index
-        parts = map_chunks(function, np.array_split(index, CHUNKS))
+        parts = map_chunks(function, np.array_split(index, CHUNKS), most=thread_count())
         return reduce(lambda total, part: tuple(a + b for a, b in zip(total, part)), parts)
 
     def moments(self):

@@ -1,5 +1,5 @@
 """The command line: mi-prt doctor | info | precompute | relight | compare."""
 
-from .commands import main
+from .program import main
 
 __all__ = ["main"]

@@ -1,14 +1,12 @@
 """The commands, one function each."""
 
-import sys
 import time
-import warnings
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from ..errors import PrtError, SettingsError
+from ..errors import SettingsError
 from . import options as take
 from .options import (
     LIGHTS_HELP,
@@ -16,6 +14,7 @@ from .options import (
     Define,
     Direct,
     Environment,
+    Force,
     Frames,
     FramesPerSecond,
     Json,
@@ -27,6 +26,7 @@ from .options import (
     Sensor,
     Size,
     Threads,
+    Variant,
     flowing,
     with_settings,
 )
@@ -73,6 +73,7 @@ def info(
     path: Annotated[Path, typer.Argument(help="A scene (XML) or an asset.")],
     settings: dict,
     define: Define = None,
+    variant: Variant = None,
     as_json: Json = False,
 ):
     """Say what a scene requires and what precomputing it will cost, or what an asset holds."""
@@ -81,6 +82,7 @@ def info(
     from ..asset.describe import describe_asset
     from ..precompute.forecast import describe
 
+    take.use(None, variant)
     if is_asset(path):
         found = describe_asset(load(path))
     else:
@@ -115,7 +117,9 @@ def precompute(
             "--max-memory", metavar="BYTES", help="Such as 3G; default: half of what is free."
         ),
     ] = None,
+    force: Force = False,
     threads: Threads = None,
+    variant: Variant = None,
     define: Define = None,
     as_json: Json = False,
 ):
@@ -130,7 +134,7 @@ def precompute(
     from ..system.files import check_writable
 
     check_writable(output)
-    take.set_threads(threads)
+    take.use(threads, variant)
     started = time.perf_counter()
     with progress_bar(kept=f"{output}.partial") as progress:
         asset, cost = measure(
@@ -140,6 +144,7 @@ def precompute(
             output,
             resume,
             max_memory,
+            force,
             **settings,
         )
     cost["seconds"]["total"] = round(time.perf_counter() - started, 4)
@@ -202,7 +207,9 @@ def relight(
     frames: Frames = None,
     fps: FramesPerSecond = None,
     scene: OtherScene = None,
+    force: Force = False,
     threads: Threads = None,
+    variant: Variant = None,
     as_json: Json = False,
 ):
     """Relight an asset: an image, a mesh with vertex radiance, plain arrays, or a film of a light
@@ -213,7 +220,7 @@ def relight(
     from ..output.moving import animate
     from ..output.relight import relight_to_file
 
-    take.set_threads(threads)
+    take.use(threads, variant)
     chosen, turned = take.light_of(envmap, light), take.rotation_of(rotate)
     asset = load(asset_path)
     shown = {
@@ -225,6 +232,7 @@ def relight(
         "component": component,
         "direct": direct,
         "rotate": turned,
+        "force": force,
     }
     film = {k: v for k, v in (("frames", frames), ("fps", fps)) if v is not None}
     if light_path is not None:
@@ -269,14 +277,16 @@ def compare(
     direct: Direct = "points",
     scene: OtherScene = None,
     seed: Seed = 0,
+    force: Force = False,
     threads: Threads = None,
+    variant: Variant = None,
     as_json: Json = False,
 ):
     """Compare an asset with Mitsuba's ground truth and write a report with pictures."""
     from ..asset.asset import load
     from ..evaluate.compare import compare as run
 
-    take.set_threads(threads)
+    take.use(threads, variant)
     asset = load(asset_path)
     with progress_bar() as progress:
         result = run(
@@ -293,38 +303,9 @@ def compare(
             progress=progress,
             nearest=nearest,
             direct=direct,
+            force=force,
         )
     _show(result if as_json else {"wrote": str(output / "index.html")} | result, as_json)
-
-
-def main(arguments=None):
-    """Run the program; exit codes: 0 done, 2 bad usage or input, 130 interrupted, 1 anything
-    else.
-    """
-    warnings.showwarning = lambda message, *_, **__: note(str(message))
-    try:
-        from ..system.runtime import quiet_mitsuba
-
-        if not _only_help(sys.argv[1:] if arguments is None else arguments):
-            quiet_mitsuba()
-        app(arguments, standalone_mode=True, prog_name="mi-prt")
-    except PrtError as error:
-        print(f"mi-prt: {error}", file=sys.stderr)
-        sys.exit(error.exit_code)
-    except KeyboardInterrupt:
-        note("interrupted")
-        sys.exit(130)
-    except MemoryError:
-        print(
-            "mi-prt: out of memory: use fewer --directions or a longer --edge-length, or set"
-            " --max-memory",
-            file=sys.stderr,
-        )
-        sys.exit(1)
-
-
-def _only_help(arguments):
-    return not arguments or any(a in ("-h", "--help") for a in arguments)
 
 
 def _show(found, as_json):

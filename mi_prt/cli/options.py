@@ -35,6 +35,14 @@ Json = Annotated[
 Threads = Annotated[
     int | None, typer.Option("--threads", metavar="N", help="CPU threads; default: all cores.")
 ]
+Variant = Annotated[
+    str | None,
+    typer.Option(
+        "--variant",
+        metavar="NAME",
+        help="What Mitsuba computes on: llvm_ad_rgb, the default, or cuda_ad_rgb (docs/cuda.md).",
+    ),
+]
 Define = Annotated[
     list[str] | None,
     typer.Option("-D", metavar="NAME=VALUE", help="Value for a <default> parameter of the XML."),
@@ -92,6 +100,9 @@ Frames = Annotated[
 ]
 FramesPerSecond = Annotated[
     int | None, typer.Option("--fps", metavar="N", help=f"Frames of the film in a second [{FPS}].")
+]
+Force = Annotated[
+    bool, typer.Option("--force", help="Replace a file that was not written by mi-prt.")
 ]
 Seed = Annotated[int, typer.Option("--seed", help="Same seed, same result.")]
 
@@ -193,8 +204,12 @@ def size_of(text):
     return int(width), int(height)
 
 
-def set_threads(threads):
-    """Use so many CPU threads; None leaves it."""
+def use(threads, variant):
+    """Use so many CPU threads and a variant of Mitsuba; None leaves them."""
+    if variant is not None:
+        from ..system.runtime import set_variant
+
+        set_variant(variant)
     if threads is not None:
         from ..system.runtime import set_threads
 

@@ -3,11 +3,15 @@
 import json
 import sys
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 from ..evaluate.report import finite
 
 LOG_SECONDS = 20  # between lines of progress where there is no terminal
+
+
+class Said(SystemExit):
+    """The end of the program, of which the user has been told why."""
 
 
 def print_json(value):
@@ -15,7 +19,16 @@ def print_json(value):
 
 
 def note(text):
-    print(f"mi-prt: {text}", file=sys.stderr)
+    """One line on stderr; it is not worth an error that nobody can read it."""
+    with suppress(OSError):
+        print(f"mi-prt: {printable(text)}", file=sys.stderr, flush=True)
+
+
+def printable(text):
+    """The text in one line, with escapes for what would move the cursor, colour the terminal or be
+    seen as nothing: a path may hold it.
+    """
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
 
 
 def table(rows):
@@ -31,17 +44,17 @@ def table(rows):
 def print_nested(value, indent=""):
     for key, entry in value.items():
         if isinstance(entry, dict) and entry:
-            print(f"{indent}{key}:")
+            print(f"{indent}{printable(key)}:")
             print_nested(entry, indent + "  ")
         elif isinstance(entry, list) and entry and isinstance(entry[0], dict):
-            print(f"{indent}{key}:")
+            print(f"{indent}{printable(key)}:")
             for item in entry:
                 print(
                     f"{indent}  - "
                     + ", ".join(f"{k} {_plain(v)}" for k, v in item.items() if v not in (None, []))
                 )
         else:
-            print(f"{indent}{key}: {_plain(entry)}")
+            print(f"{indent}{printable(key)}: {_plain(entry)}")
 
 
 def _plain(entry):
@@ -51,7 +64,7 @@ def _plain(entry):
         return ", ".join(_plain(x) for x in entry) or "none"
     if isinstance(entry, int) and not isinstance(entry, bool):
         return f"{entry:,}"
-    return str(entry)
+    return printable(str(entry))
 
 
 @contextmanager
@@ -99,4 +112,4 @@ def progress_bar(kept=None):
                 "interrupted; nothing is left half-written"
                 + (f", and --resume continues ({kept})" if kept else "")
             )
-            sys.exit(130)
+            raise Said(130) from None

@@ -82,13 +82,14 @@ class Hemisphere:
         square = mi.warp.uniform_disk_to_square_concentric(
             mi.Point2f(direction.x * scale, direction.y * scale)
         )
-        x = dr.clip(square.x * self.columns - 0.5, 0, self.columns - 1)
-        y = dr.clip(square.y * self.rows - 0.5, 0, self.rows - 1)
-        i, j = dr.minimum(mi.UInt32(x), self.columns - 2), dr.minimum(mi.UInt32(y), self.rows - 2)
+        columns, rows = (dr.opaque(mi.UInt32, n) for n in (self.columns, self.rows))
+        x = dr.clip(square.x * mi.Float(columns) - 0.5, 0, mi.Float(columns - 1))
+        y = dr.clip(square.y * mi.Float(rows) - 0.5, 0, mi.Float(rows - 1))
+        i, j = dr.minimum(mi.UInt32(x), columns - 2), dr.minimum(mi.UInt32(y), rows - 2)
         u, v = x - mi.Float(i), y - mi.Float(j)
-        first = j * self.columns + i
+        first = j * columns + i
         return (
-            (first, first + 1, first + self.columns, first + self.columns + 1),
+            (first, first + 1, first + columns, first + columns + 1),
             ((1 - u) * (1 - v), u * (1 - v), (1 - u) * v, u * v),
         )
 

@@ -11,15 +11,20 @@ import numpy as np
 
 from ..asset.provenance import open_scene_of
 from ..errors import SettingsError
+from ..lighting.light import Light
 from ..lighting.to_mitsuba import lit_scene
 from ..render.image import pick_sensor, render_image, resized
+from ..render.integrator import check_direct
 from ..render.picture import Picture
+from ..render.rendered import check_picture
 from ..scene.scene import Scene
+from ..system.files import check_own
+from ..transport.transport import Question
 from . import ground_truth
 from .local_lights import stand_in_error
 from .near_emitters import near_emitters
 from .norms import errors_at_points, image_errors
-from .report import write_report
+from .report import NAMES, is_report, write_report
 from .views import compared_points, first_hits, visible_weights
 
 REFERENCES = ("modelled", "full")
@@ -45,6 +50,7 @@ def compare(
     progress=lambda stage, done, total: None,
     nearest=None,
     direct="points",
+    force=False,
 ):
     """Compare an asset with Mitsuba and write the comparison to a folder.
 
@@ -73,6 +79,8 @@ def compare(
         Directions that stand for a local light, see `Asset.irradiance`.
     direct : 'points' or 'pixels'
         Where direct light of local lights is computed for the image.
+    force : bool
+        Whether to replace files in the folder that are of no report.
 
     Returns
     -------
@@ -95,11 +103,14 @@ def compare(
     """
     if reference not in REFERENCES:
         raise SettingsError(f"reference '{reference}' is not known: use {' or '.join(REFERENCES)}")
+    check_picture(size, sensor, spp, seed)
+    check_direct(direct)
+    Question(Light(()), nearest=nearest)  # which checks it
     if spp < 2:
         raise SettingsError(
             f"spp {spp} is too low: the reference's noise is told from two halves, so at least 2"
         )
-    folder = _made_folder(folder)
+    folder = _made_folder(folder, force)
     opened = open_scene_of(asset, scene)
     resolved = asset.resolved(light, rotate, opened)
     as_written = reference == "full" and light is None and rotate is None
@@ -138,7 +149,7 @@ def compare(
         "transports": {kind: t.summary() for kind, t in asset.transports.items()},
         # reflections that were not asked for are missing in the truth as well
         "ledger": [e.as_dict() for e in asset.ledger() if bounces is None or e.knob != "bounces"],
-        **stand_in_error(asset, resolved, nearest, lambda: opened, seed),
+        **stand_in_error(asset, resolved, nearest, opened, seed),
         "points": {"count": len(points.index)} | points.errors(irradiance),
         "components": points.component_errors(picture),
         "image": image_errors(result, expected, hits.covered, hits.emits),
@@ -204,7 +215,7 @@ class _Points:
         }
 
 
-def _made_folder(folder):
+def _made_folder(folder, force):
     folder = Path(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -214,4 +225,6 @@ def _made_folder(folder):
         raise SettingsError(
             f"output folder '{folder}' cannot be written: {error.strerror}"
         ) from None
+    for name in NAMES:
+        check_own(folder / name, lambda _: is_report(folder), force)
     return folder

@@ -4,8 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..render.developed import rendered
-from ..render.image import check_samples
+from ..render.developed import developed
 from ..scene.bounds import scale_of
 from ..system.runtime import mitsuba
 
@@ -308,14 +307,12 @@ def image(mi_scene, sensor, spp, seed=0, max_depth=2):
 
     Raises
     ------
-    SettingsError
-        See `check_samples`.
+    SettingsError, SceneError
+        See `rendered`.
     """
-    mi = mitsuba()
-    integrator = mi.load_dict({"type": "path", "max_depth": max_depth})
+    integrator = mitsuba().load_dict({"type": "path", "max_depth": max_depth})
     half = max(1, (spp + 1) // 2)
-    check_samples(sensor, half)
     first, second = (
-        rendered(mi_scene, sensor, integrator, half, s) for s in (2 * seed, 2 * seed + 1)
+        developed(mi_scene, sensor, integrator, half, s) for s in (2 * seed, 2 * seed + 1)
     )
     return Reference((first + second) / 2, np.abs(first - second) / 2)

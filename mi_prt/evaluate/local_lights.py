@@ -70,9 +70,9 @@ def measure_error(asset, light, nearest, scene, seed=0):
     return error
 
 
-def stand_in_error(asset, light, nearest, open_scene, seed=0):
+def stand_in_error(asset, light, nearest, scene, seed=0):
     """The entry local_light_error{…} where transport of distant light stands in for local lights;
-    nothing where it does not, or where the scene is not to be had (with a warning).
+    nothing where it does not, or where the scene cannot be rebuilt (with a warning).
 
     Parameters
     ----------
@@ -80,8 +80,8 @@ def stand_in_error(asset, light, nearest, open_scene, seed=0):
     light : Light
         Resolved.
     nearest : int, optional
-    open_scene : callable() returning Scene or None
-        None where it is not worth to open it.
+    scene : Scene
+        That of the asset.
     seed : int
     """
     shares = asset.shared_out(light)
@@ -90,9 +90,6 @@ def stand_in_error(asset, light, nearest, open_scene, seed=0):
         return {}
     found = asset.warnings(shares)
     try:
-        scene = open_scene()
-        if scene is None:
-            return {}
         return {"local_light_error": measure_error(asset, local, nearest, scene, seed)}
     except SceneError as error:
         warning = f"{found[0]}; by" if found else "local lights: by"

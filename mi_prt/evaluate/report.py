@@ -8,10 +8,11 @@ import numpy as np
 
 from ..render.display import LUMINANCE, display
 from ..render.image_file import write_displayed, write_image
+from ..system.files import replacing
 from . import metrics
 
 _PAGE = """<!doctype html>
-<html lang="en"><meta charset="utf-8"><title>mi_prt comparison</title>
+<html lang="en"><meta charset="utf-8">{mark}
 <style>
 body {{ font: 16px/1.5 system-ui, sans-serif; max-width: 72rem; margin: 2rem auto }}
 body {{ padding: 0 1rem; color: #222 }}
@@ -41,7 +42,21 @@ bright is different</figcaption></figure>
 <ul>{causes}</ul>
 </html>
 """
+_TITLE = "<title>mi_prt comparison</title>"
 ERROR_RANGE = 0.5
+_PICTURES = ("result", "reference", "error", "flip", "side_by_side")
+NAMES = ("report.json", "index.html", "result.exr", "reference.exr") + tuple(
+    f"{name}.png" for name in _PICTURES
+)
+
+
+def is_report(folder):
+    """Whether a folder holds a report of this program."""
+    try:
+        with open(Path(folder) / "index.html", encoding="utf-8", errors="replace") as file:
+            return _TITLE in file.read(1 << 12)
+    except OSError:
+        return False
 
 
 def write_report(folder, report, result, reference, covered):
@@ -72,10 +87,10 @@ def write_report(folder, report, result, reference, covered):
     ):
         write_displayed(folder / f"{name}.png", picture)
     write_displayed(folder / "side_by_side.png", np.concatenate([shown, truth, error], axis=1))
-    (folder / "report.json").write_text(
-        json.dumps(finite(report), indent=2, allow_nan=False) + "\n"
-    )
-    (folder / "index.html").write_text(_page(report))
+    numbers = json.dumps(finite(report), indent=2, allow_nan=False) + "\n"
+    for name, text in (("report.json", numbers), ("index.html", _page(report))):
+        with replacing(folder / name) as temporary:
+            Path(temporary).write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
 def finite(value):
@@ -109,6 +124,7 @@ def _page(report):
         return "".join(f"<td>{errors[key]:.2%}</td>" for key in keys)
 
     return _PAGE.format(
+        mark=_TITLE,
         title=html.escape(Path(report["scene"] or "scene in memory").name),
         summary=html.escape(
             f"{_held(report)} Relit in {1e3 * report['seconds']['relight']:.0f} ms; the reference"

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..errors import SettingsError
+from ..render.rendered import rendered
 from ..system.runtime import mitsuba
 
 LANES = 1 << 21
@@ -60,9 +61,7 @@ def first_hits(mi_scene, sensor, spp, seed=0):
             # Beside the colour, which the film may convert to another format.
             return ["hit", "emits"]
 
-    seen = np.array(
-        mi.render(mi_scene, sensor=sensor, integrator=Seen(mi.Properties()), spp=spp, seed=seed)
-    )
+    seen = rendered(mi_scene, sensor, Seen(mi.Properties()), spp, seed)
     return FirstHits(seen[..., -2], np.abs(seen[..., -1]) > 0)
 
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from ..errors import LightError
 from ..system.runtime import mitsuba
+from ..system.whole import check_whole
 from .emission import flat_emission
 from .part import LIGHTS, LocalPart
 from .values import fields_from_text, is_finite, rgb, rgb_factor, rgb_spectrum, vector
@@ -14,6 +15,7 @@ from .values import fields_from_text, is_finite, rgb, rgb_factor, rgb_spectrum, 
 # sine of the least angle between the edges of an area light: with less, float32 does not tell its
 # normal
 FLATTEST = 1e-6
+MAX_SAMPLES = 100**2  # of one lamp
 
 
 @LIGHTS.register
@@ -33,8 +35,9 @@ class AreaLight(LocalPart):
     radiance : (3,) array or float
         RGB in W/(m² sr); one number is grey.
     samples : int, default 25
-        Places that stand for it, a square number: the centres of √samples × √samples equal parts. A
-        surface nearer than about the size of a part tells them apart.
+        Places that stand for it, a square number of 10,000 at most: the centres of
+        √samples × √samples equal parts. A surface nearer than about the size of a part tells them
+        apart.
 
     Raises
     ------
@@ -72,18 +75,16 @@ class AreaLight(LocalPart):
                 "an area light's radiance times its area must be a finite float32 number, got"
                 f" {area:g} m²"
             )
-        count = self.samples
-        if (
-            isinstance(count, bool)
-            or not isinstance(count, int | np.integer)
-            or count < 1
-            or isqrt(count) ** 2 != count
-        ):
+        remedy = "each is a light of its own, and 25 or 100 resolve most lamps"
+        count = check_whole(
+            "an area light's samples", self.samples, 1, MAX_SAMPLES, remedy, LightError
+        )
+        if isqrt(count) ** 2 != count:
             raise LightError(
                 "an area light's samples must be a square number such as 1, 4, 9, 16 or 25, got"
                 f" {count}"
             )
-        object.__setattr__(self, "samples", int(count))
+        object.__setattr__(self, "samples", count)
         object.__setattr__(self, "area", float(area))
         object.__setattr__(self, "normal", across / area)
 

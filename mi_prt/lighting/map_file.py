@@ -5,7 +5,9 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import LightError
-from ..system.runtime import a_worker_at_least, mitsuba
+from ..system.files import why_no_file
+from ..system.runtime import mitsuba
+from ..system.workers import a_worker_at_least
 
 _COLOURS = "RGB", "XYZ", "Y"  # names of channels of which Mitsuba makes colours
 
@@ -14,8 +16,8 @@ def read_pixels(source):
     """Pixels of a path, a mi.Bitmap or whatever NumPy takes, not checked; see `EnvironmentMap`."""
     if isinstance(source, str | Path):
         path = Path(source)
-        if not path.is_file():
-            raise LightError(f"environment map '{path}' does not exist")
+        if reason := why_no_file(path):
+            raise LightError(f"environment map '{path}' {reason}: give an image (.exr, .hdr)")
         return _read(path)
     if type(source).__module__.startswith("mitsuba"):
         return _from_bitmap(source)

@@ -4,6 +4,7 @@ without a new kernel.
 
 import numpy as np
 
+from ..system.arrays import packets
 from ..system.runtime import mitsuba
 
 _OWN = 12  # floats of a place
@@ -31,7 +32,7 @@ class Places:
         )
         extra = np.empty((len(emission), 0)) if extra is None else extra
         self._loads = (_OWN + extra.shape[1]) // 4
-        self._floats = mi.Float(np.hstack([*columns, extra]).astype(np.float32).ravel())
+        self._floats = packets(np.hstack([*columns, extra]))
         # Gathered, like all else: a number by itself compiles another kernel where its memory is
         # aligned otherwise.
         self.count = dr.gather(mi.UInt32, mi.UInt32([len(emission), 0]), mi.UInt32(0))

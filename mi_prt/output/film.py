@@ -1,5 +1,6 @@
 """Light that moves along a path, and frames as a video file or numbered images."""
 
+import os
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -11,10 +12,12 @@ import numpy as np
 
 from ..errors import SettingsError
 from ..render.image_file import to_8bit, write_displayed
-from ..system.files import check_writable, replacing
+from ..system.files import MARK, check_own, check_writable, is_marked, replacing
+from ..system.whole import check_whole
 
 VIDEOS = (".mp4", ".gif")
 FRAMES, FPS = 48, 25  # of a film, by default
+MAX_FRAMES = 100_000  # more than an hour
 MAX_FPS = {".mp4": 240, ".gif": 50}  # viewers slow down a GIF of more
 PATH_FORM = "write it as 'x,y,z x,y,z …', two or more positions separated by spaces or semicolons"
 _STEPS = 1024  # of the polygon that measures and stands for each piece of a path
@@ -68,10 +71,9 @@ class LightPath:
         Raises
         ------
         SettingsError
-            If `frames` is not an integer ≥ 1.
+            If `frames` is not an integer from 1 to `MAX_FRAMES`.
         """
-        if isinstance(frames, bool) or not isinstance(frames, int | np.integer) or frames < 1:
-            raise SettingsError(f"frames must be an integer ≥ 1, got {frames!r}")
+        check_whole("frames", frames, 1, MAX_FRAMES, "write longer films in parts")
         polygon = self._polygon()
         length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(polygon, axis=0), axis=1))])
         wanted = np.linspace(0, length[-1], frames, endpoint=not self.closed)
@@ -119,8 +121,10 @@ def light_path(text):
     return LightPath(np.array(positions))
 
 
-def check_frames_output(output, fps=25):
-    """Raise SettingsError unless `write_frames` can write there."""
+def check_frames_output(output, fps=25, frames=1, force=False):
+    """Raise SettingsError unless `write_frames` can write so many frames there; and, without
+    `force`, if that would replace files of others.
+    """
     output = Path(output)
     suffix = output.suffix.lower()
     if suffix in VIDEOS:
@@ -129,6 +133,7 @@ def check_frames_output(output, fps=25):
                 f"fps of {suffix} must be above 0 and at most {MAX_FPS[suffix]}, got {fps}"
             )
         check_writable(output)
+        check_own(output, is_marked, force)
     elif suffix == ".png":
         if output.name.count("%") != 1 or not _NUMBER.search(output.name):
             raise SettingsError(
@@ -136,6 +141,8 @@ def check_frames_output(output, fps=25):
                 " 'frame-%03d.png'"
             )
         check_writable(_numbered(output, 0))
+        for number in range(frames):
+            check_own(_numbered(output, number), is_marked, force)
     else:
         raise SettingsError(
             f"output '{output}' must end in {', '.join(VIDEOS)}, or be numbered like"
@@ -172,7 +179,7 @@ def write_frames(output, frames: Iterable, fps=25):
     ----- H.264 needs an even width and height: the last row or column is repeated. A quarter of the
     resolution carries colour.
     """
-    check_frames_output(output, fps)
+    check_frames_output(output, fps, force=True)
     output, images = Path(output), _images(frames)
     if output.suffix.lower() == ".png":
         count = 0
@@ -212,6 +219,7 @@ def _write_mp4(path, images, fps):
     first = to_8bit(next(images))
     height, width = (side + side % 2 for side in first.shape[:2])
     with av.open(path, "w", format="mp4", options={"movflags": "+faststart"}) as file:
+        file.metadata["comment"] = MARK
         stream = file.add_stream("libx264", rate=fps, options={"crf": "18"})
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
         codec = stream.codec_context
@@ -231,7 +239,7 @@ def _write_mp4(path, images, fps):
             )
             file.mux(stream.encode(frame))
         file.mux(stream.encode())
-        return count
+    return count
 
 
 def _write_gif(path, images, fps):
@@ -264,4 +272,12 @@ def _write_gif(path, images, fps):
             graph.push(frame)
             file.mux(stream.encode(graph.pull()))  # pyright: ignore[reportArgumentType]
         file.mux(stream.encode())
-        return count
+    _mark_gif(path)
+    return count
+
+
+def _mark_gif(path):
+    """Add a comment, before the byte that ends a GIF."""
+    with open(path, "r+b") as file:
+        file.seek(-1, os.SEEK_END)
+        file.write(b"\x21\xfe" + bytes([len(MARK)]) + MARK.encode() + b"\0;")

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from ..errors import SettingsError
+from ..system.files import is_marked
 from ..system.registry import Registry
 
 FORMATS = Registry("output", "mi_prt.output")
@@ -48,6 +49,13 @@ class Format(ABC):
 
     kind: ClassVar[str]
     is_picture: ClassVar[bool] = False
+
+    @classmethod
+    def is_own(cls, path):
+        """Whether a file of such a name was written by this program, and may be replaced: by
+        default, whether it holds `MARK` (mi_prt.system.files).
+        """
+        return is_marked(path)
 
     @classmethod
     @abstractmethod

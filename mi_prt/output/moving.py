@@ -8,7 +8,10 @@ from ..asset.provenance import open_scene_of
 from ..errors import LightError
 from ..lighting.light import Light
 from ..render.display import display
+from ..render.integrator import check_direct
 from ..render.picture import RENDERERS, Picture
+from ..render.rendered import check_picture
+from ..transport.transport import Question
 from .film import FPS, FRAMES, check_frames_output, write_frames
 
 FRAME_SAMPLES = 1  # of a frame's pixel, along each side, of splats
@@ -30,6 +33,7 @@ def animate(
     direct="points",
     progress=lambda stage, done, total, detail="": None,
     rotate=None,
+    force=False,
 ):
     """Move the first local light along a path, and write a frame for each place of it.
 
@@ -42,7 +46,7 @@ def animate(
     frames, fps : int
     light : what `as_light` accepts, or a list of such
         Whose first point, spot or area light moves; all else stays.
-    scene, sensor, size, renderer, spp, component, direct, rotate :
+    scene, sensor, size, renderer, spp, component, direct, rotate, force :
         As of `relight_to_file`.
     progress : callable(stage, done, total, detail)
 
@@ -52,10 +56,13 @@ def animate(
         points, frames, seconds{relight, render} of all frames.
     """
     RENDERERS[renderer]
-    check_frames_output(output, fps)
+    check_picture(size, sensor, spp)
+    check_direct(direct)
+    Question(Light(()), component)  # which checks it
+    places = path.positions(frames)
+    check_frames_output(output, fps, frames, force)
     opened = open_scene_of(asset, scene)
     moving = _Moving(asset.resolved(light, rotate, opened))
-    places = path.positions(frames)
     first = moving.at(places[0])
     film = _Film(Picture(asset, opened, first, component, direct), moving, progress, frames)
     # A light that is a shape is seen: what is drawn changes with its place.

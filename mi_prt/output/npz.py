@@ -1,8 +1,10 @@
 """Relit points as plain arrays."""
 
+from zipfile import ZipFile
+
 import numpy as np
 
-from ..system.files import replacing
+from ..system.files import MARK, replacing
 from .formats import FORMATS, Format
 
 
@@ -37,7 +39,7 @@ def write_npz(path, asset, radiance, irradiance):
         If the path cannot be written.
     """
     points = asset.points
-    with replacing(path) as temporary, open(temporary, "wb") as file:
+    with replacing(path) as temporary, open(temporary, "w+b") as file:
         np.savez(
             file,
             positions=points.positions,
@@ -48,3 +50,5 @@ def write_npz(path, asset, radiance, irradiance):
             irradiance=irradiance,
             radiance=radiance,
         )
+        with ZipFile(file, "a") as archive:
+            archive.comment = MARK.encode()

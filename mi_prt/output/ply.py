@@ -4,7 +4,7 @@ import numpy as np
 
 from ..render.display import display, exposure
 from ..render.image_file import to_8bit
-from ..system.files import replacing
+from ..system.files import MARK, replacing
 from .formats import FORMATS, Format
 
 PLY_TYPES = {"<f4": "float", "|u1": "uchar"}
@@ -65,6 +65,7 @@ def write_ply(path, asset, radiance):
     header = [
         "ply",
         "format binary_little_endian 1.0",
+        f"comment {MARK}",
         "comment radiance in W/(m^2 sr), linear sRGB primaries; red, green, blue for display",
         f"element vertex {len(vertices)}",
         *properties,

@@ -1,13 +1,19 @@
 """From an asset and light to a file: image, mesh with vertex radiance, or plain arrays."""
 
 import time
+import warnings
 
 from ..asset.provenance import open_scene_of
-from ..evaluate.local_lights import stand_in_error
+from ..errors import SettingsError
+from ..lighting.environment import LightWarning
+from ..lighting.light import Light
 from ..render.display import exposure
+from ..render.integrator import check_direct
 from ..render.picture import RENDERERS, Picture
-from ..system.files import check_writable
-from .formats import Relit, format_of
+from ..render.rendered import check_picture
+from ..system.files import check_own, check_writable
+from ..transport.transport import Question
+from .formats import FORMATS, Relit, format_of
 
 
 def relight_to_file(
@@ -23,6 +29,7 @@ def relight_to_file(
     nearest=None,
     component="total",
     direct="points",
+    force=False,
 ):
     """Relight an asset and write the result.
 
@@ -51,13 +58,13 @@ def relight_to_file(
     direct : 'points' or 'pixels'
         Where direct light of local lights is computed: at the points, or with shadow rays at each
         pixel.
+    force : bool
+        Whether to replace a file that this program has not written.
 
     Returns
     -------
     dict
-        points, seconds{relight, render}. Where transport of distant light stands in for local
-        lights, and the scene is at hand, also local_light_error{relative_rmse, bias, points}, the
-        error of their irradiance against Mitsuba's.
+        points, seconds{relight, render}.
 
     Raises
     ------
@@ -67,11 +74,20 @@ def relight_to_file(
     -----
     LightWarning
         If a local light is inside the convex hull of the scene and only transport of distant light
-        is there for it; with the measured error.
+        is there for it. `compare` measures its error.
     """
     written = format_of(output)
     RENDERERS[renderer]
+    check_picture(size, sensor, spp)
+    Question(Light(()), component, nearest)  # which checks them
+    if check_direct(direct) == "pixels" and not written.is_picture:
+        pictures = " or ".join(name for name in FORMATS if FORMATS[name].is_picture)
+        raise SettingsError(
+            f"direct light at pixels is of pictures, and '{output}' holds points: write {pictures},"
+            " or leave direct (--direct) at points"
+        )
     check_writable(output)
+    check_own(output, written.is_own, force)
     opened = open_scene_of(asset, scene) if written.is_picture else None
     resolved = asset.resolved(light, rotate, opened or scene)
     clock = [time.perf_counter()]
@@ -91,14 +107,10 @@ def relight_to_file(
     written.write(output, relit)
     clock.append(time.perf_counter())
     seconds = zip(("relight", "render"), clock, clock[1:])
-    result = {
+    for warning in asset.warnings(asset.shared_out(resolved)):
+        text = f"{warning}; compare tells how far such light is off (mi-prt compare)"
+        warnings.warn(text, LightWarning, stacklevel=2)
+    return {
         "points": len(asset.points),
         "seconds": {name: round(b - a, 5) for name, a, b in seconds},
     }
-
-    def at_hand():
-        """The scene where it is open already, or worth opening."""
-        wanted = asset.warnings(asset.shared_out(resolved))
-        return opened or (open_scene_of(asset, scene) if wanted else None)
-
-    return result | stand_in_error(asset, resolved, nearest, at_hand)

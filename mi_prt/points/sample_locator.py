@@ -4,6 +4,7 @@ import numpy as np
 
 from ..errors import SceneError
 from ..scene.materials import facing
+from ..system.arrays import packets
 from ..system.runtime import mitsuba
 from .layout import Locator
 
@@ -60,7 +61,7 @@ class SampleLocator:
         self._starts, self._samples = mi.UInt32(starts), mi.UInt32(samples)
         # 4 floats each: gathered in one load
         self._positions, self._normals = (
-            mi.Float(np.pad(x, ((0, 0), (0, 1))).ravel()) for x in (positions, normals)
+            packets(np.pad(x, ((0, 0), (0, 1)))) for x in (positions, normals)
         )
         self._low, self._size = mi.Point3f(*map(float, low)), mi.Vector3i(*map(int, size))
         dr.make_opaque(self._low, self._size)

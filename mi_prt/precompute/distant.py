@@ -16,6 +16,7 @@ from ..transport.distant import DistantTransport
 from ..transport.hops import blocked_share
 from .budget import INDIRECT_LANE_BYTES, LANE_BYTES, Budget, held_coefficient_bytes
 from .distant_forecast import forecast
+from .distant_pilot import check_share
 from .job import BUILDERS, Builder
 from .reflections import IndirectTransport, direct_report, surface_shares
 
@@ -38,6 +39,8 @@ class DistantBuilder(Builder):
         self._budget = Budget(
             job.limit, job.scene, points, self._directions, settings, self._target
         )
+        if self._target.components is None:
+            check_share(job, self._directions, self._target, self._budget)
 
     @classmethod
     def wanted(cls, scene, given):

@@ -12,7 +12,6 @@ from ..transport.hops import blocked_share
 from ..transport.interreflection import BOUNCE_TOLERANCE
 from ..transport.paths import PathSampler, energies
 from .budget import LANE_BYTES, POINT_BYTES, expected_channels, held_coefficient_bytes
-from .reflections import surface_shares
 
 PROBE_POINTS = 256
 PROBE_BLOCKS = 32
@@ -103,11 +102,11 @@ def _probe_reflections(job, directions):
         energy (see `BounceSplit`; direct light within about 3 %, reflections 20 %), bounces
         (expected), rate (paths per second), paths (from each point).
     """
-    settings, points = job.settings, job.points
-    index = np.random.default_rng(settings.seed).permutation(len(points))[:PROBE_POINTS]
-    few = points.at(index)
+    settings = job.settings
+    few = job.points.at(_by_area(job.points.areas, settings.seed))
     transport = sample_direct(job.scene, few, directions)
-    weights = surface_shares(few, find_buried(job.scene, few, transport.dark()))
+    shown = ~find_buried(job.scene, few, transport.dark())
+    weights = shown / max(shown.sum(), 1)
     direct = float(weights @ (1 - blocked_share(transport, directions.solid_angles)))
     wanted = None if settings.distant_bounces == "auto" else settings.distant_bounces
     if wanted == 0:
@@ -127,6 +126,16 @@ def _probe_reflections(job, directions):
         "rate": rate,
         "paths": EXPECTED_PATHS if auto else settings.paths_per_point,
     }
+
+
+def _by_area(areas, seed):
+    """Indices of the probed points, each drawn in proportion to its area: light is told in means
+    over surface, and of points drawn evenly a few large ones would be nearly all of it.
+    """
+    ends = np.cumsum(areas, dtype=np.float64)
+    count = min(PROBE_POINTS, len(areas))
+    places = (np.arange(count) + np.random.default_rng(seed).random()) / count * ends[-1]
+    return np.minimum(np.searchsorted(ends, places, side="right"), len(areas) - 1)
 
 
 def _indirect_seconds(reflections, points, components, channels, product):
@@ -175,7 +184,7 @@ def _bounces_reason(settings, reflections):
     if settings.distant_bounces != "auto":
         return "as asked"
     if reflections["bounces"] == 0:
-        return "none: no point sees another that reflects"
+        return f"none: at {PROBE_POINTS} points that were probed no reflected light arrives"
     return f"until 0.1 % of the light is left, here about {reflections['bounces']}"
 
 

@@ -1,19 +1,21 @@
 """From a scene to an asset: points, then one transport after the other."""
 
 import hashlib
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 
 from ..asset.asset import Asset
+from ..asset.container import is_own
 from ..asset.provenance import describe_scene, emitter_records
 from ..errors import SettingsError
 from ..points.clusters import make_clusters
 from ..points.points import Points
 from ..points.samples import scatter_points
 from ..scene.scene import open_scene
+from ..system.files import check_own, check_writable
 from ..system.memory import free_bytes, parse_bytes, resident_bytes
 from ..system.runtime import count_kernels, peak_memory_bytes, versions
 from .exposed import exposed_points
@@ -29,6 +31,7 @@ def precompute(
     output=None,
     resume=False,
     max_memory=None,
+    force=False,
     **settings,
 ):
     """Precompute a scene's transport.
@@ -54,6 +57,8 @@ def precompute(
     max_memory : int or str, optional
         Bytes, or text such as '3G', that this process may have resident. By default what it has now
         and half of what is free.
+    force : bool
+        Whether to replace a file at `output` that is no asset.
     **settings
         Fields of `Settings`. `transports` and `points` are chosen for the scene unless they are
         given; a setting that would mean nothing is refused.
@@ -68,7 +73,7 @@ def precompute(
         See `open_scene`, `sample_points`, `scatter_points`, `Settings`, `make_plan`,
         `workspace.durable`.
     """
-    return measure(scene, parameters, progress, output, resume, max_memory, **settings)[0]
+    return measure(scene, parameters, progress, output, resume, max_memory, force, **settings)[0]
 
 
 def measure(
@@ -78,6 +83,7 @@ def measure(
     output=None,
     resume=False,
     max_memory=None,
+    force=False,
     **settings,
 ):
     """`precompute`, and what it cost.
@@ -89,6 +95,8 @@ def measure(
         rays, kernels (compiled), peak_memory_bytes, seconds of the stages of this run alone.
     """
     if output is not None:
+        check_writable(output)
+        check_own(output, is_own, force)
         output = Path(output).resolve()
     elif resume:
         raise SettingsError("resume needs the output of the run to continue")
@@ -104,7 +112,7 @@ def measure(
         with _workspace(output, job, builders, resume) as job.workspace:
             asset = _built(job, plan, builders)
             if output is not None:
-                asset.save(output, job.workspace.folder)
+                asset.save(output, job.workspace.folder, force)
                 job.clock.lap("write")
     cost = {
         "rays": sum(t.report["rays"] for t in asset.transports.values()),
@@ -229,8 +237,11 @@ def _built(job, plan, builders):
         job.clock.lap(builder.kind)
     scene, settings = job.scene, job.settings
     used = asdict(settings)
-    if "distant" in transports:
-        used["coefficients"] = len(transports["distant"].basis)
+    if "distant" in transports and settings.coefficients is None:
+        with suppress(SettingsError):  # the basis none takes no number
+            used["coefficients"] = replace(
+                settings, coefficients=len(transports["distant"].basis)
+            ).coefficients
     if "edge_length" in job.points.report:
         used["edge_length"] = job.points.report["edge_length"]
     return Asset(

@@ -5,6 +5,8 @@ documentation are made.
 from dataclasses import make_dataclass
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from ..basis.basis import BASES
 from ..basis.target import Target
 from ..directions import parse_directions
@@ -37,7 +39,8 @@ class _Transports(Option):
         """See `Option.check`."""
         if value == "auto":
             return value
-        names = value.split(",") if isinstance(value, str) else list(value)
+        is_text = isinstance(value, str)
+        names = value.split(",") if is_text else list(value) if np.iterable(value) else []
         unknown = [name for name in names if name not in TRANSPORTS]
         if unknown or not names or len(set(names)) < len(names):
             raise SettingsError(

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import RuntimeSetupError, SettingsError
-from ..system.runtime import pyrender as load_pyrender
-from ..system.runtime import raster_install_command, raster_platform
+from ..system.opengl import pyrender as load_pyrender
+from ..system.opengl import raster_install_command, raster_platform
 
 pyrender = load_pyrender()  # chooses the OpenGL platform, before OpenGL is imported
 from OpenGL import GL

@@ -3,7 +3,7 @@
 import numpy as np
 
 from ..errors import SettingsError
-from ..system.runtime import mitsuba
+from .rendered import rendered
 
 # Linear sRGB of X, Y and Z (IEC 61966-2-1), as Mitsuba takes it.
 _FROM_XYZ = np.array(
@@ -15,7 +15,7 @@ _FROM_XYZ = np.array(
 )
 
 
-def rendered(mi_scene, sensor, integrator, spp, seed=0):
+def developed(mi_scene, sensor, integrator, spp, seed=0):
     """An image of linear RGB, as the film of the sensor sees it: grey where it holds luminance.
 
     Parameters
@@ -34,10 +34,12 @@ def rendered(mi_scene, sensor, integrator, spp, seed=0):
     Raises
     ------
     SettingsError
-        If the film holds none of these.
+        If the film holds none of these; see also `rendered`.
+    SceneError, PrtError
+        See `rendered`.
     """
-    image = mitsuba().render(mi_scene, sensor=sensor, integrator=integrator, spp=spp, seed=seed)
-    return colours(np.array(image, dtype=np.float32), channels(sensor.film()))
+    image = rendered(mi_scene, sensor, integrator, spp, seed)
+    return colours(image, channels(sensor.film()))
 
 
 def channels(film):

@@ -2,15 +2,11 @@
 
 from contextlib import contextmanager
 
-import numpy as np
-
 from ..errors import SettingsError
 from ..system.runtime import mitsuba
-from .developed import rendered
+from .developed import developed
 from .integrator import integrator_for
-
-MAX_PIXELS = 1 << 26
-MAX_LANES = (1 << 32) - 1  # of a wavefront: more end the process
+from .rendered import check_film, check_size, rendered
 
 
 def render_image(asset, mi_scene, sensor, spp=64, seed=0, irradiance=None, direct="points"):
@@ -37,24 +33,11 @@ def render_image(asset, mi_scene, sensor, spp=64, seed=0, irradiance=None, direc
 
     Raises
     ------
-    SettingsError
-        See `check_samples`.
+    SettingsError, SceneError
+        See `rendered`.
     """
-    check_samples(sensor, spp)
     integrator = integrator_for(asset, irradiance, direct)
-    return rendered(mi_scene, sensor, integrator, spp, seed)
-
-
-def check_samples(sensor, spp):
-    """Raise SettingsError unless a sensor's image can have so many samples in each pixel: one at
-    least, and all of them in one wavefront.
-    """
-    width, height = sensor.film().crop_size()
-    most = MAX_LANES // (width * height)
-    if not 1 <= spp <= most:
-        raise SettingsError(
-            f"spp must be 1…{most:,} for an image of {width}x{height} pixels, got {spp}"
-        )
+    return developed(mi_scene, sensor, integrator, spp, seed)
 
 
 def pick_sensor(mi_scene, index):
@@ -89,19 +72,11 @@ def resized(sensor, size):
         pixels.
     """
     if size is None:
-        width, height = sensor.film().crop_size()
-        if min(width, height) < 1:
-            raise SettingsError(
-                f"the sensor's film has {width}x{height} pixels: give it a width and a height of at"
-                " least 1, or an image size (--size WxH)"
-            )
+        check_film(sensor)
         yield sensor
         return
     width, height = size
-    if min(width, height) < 1 or width * height > MAX_PIXELS:
-        raise SettingsError(
-            f"image size {width}x{height} must be at least 1x1 and at most {MAX_PIXELS:,} pixels"
-        )
+    check_size(width, height)
     parameters = mitsuba().traverse(sensor)
     before = {
         key: list(parameters[key]) for key in ("film.size", "film.crop_size", "film.crop_offset")
@@ -131,6 +106,4 @@ def coverage(mi_scene, sensor, spp, seed=0):
         def aov_names(self):
             return ["hit"]  # beside the colour, which the film may convert
 
-    return np.array(
-        mi.render(mi_scene, sensor=sensor, integrator=Coverage(mi.Properties()), spp=spp, seed=seed)
-    )[..., -1]
+    return rendered(mi_scene, sensor, Coverage(mi.Properties()), spp, seed)[..., -1]

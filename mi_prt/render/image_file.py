@@ -5,8 +5,9 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import SettingsError
-from ..system.files import replacing
+from ..system.files import MARK, replacing
 from ..system.runtime import mitsuba
+from ..system.workers import a_worker_at_least
 from .display import display
 
 
@@ -32,7 +33,8 @@ def write_image(path, radiance, factor=1.0):
     elif suffix == ".exr":
         mi = mitsuba()
         bitmap = mi.Bitmap(np.ascontiguousarray(radiance, dtype=np.float32))
-        with replacing(path) as temporary:
+        bitmap.metadata()["comments"] = MARK
+        with replacing(path) as temporary, a_worker_at_least():
             bitmap.write(temporary, mi.Bitmap.FileFormat.OpenEXR)
     else:
         raise SettingsError(f"image '{path}' must end in .exr or .png")
@@ -47,11 +49,14 @@ def write_displayed(path, displayed):
         If the path does not end in .png or cannot be written.
     """
     from PIL import Image
+    from PIL.PngImagePlugin import PngInfo
 
     if Path(path).suffix.lower() != ".png":
         raise SettingsError(f"displayed image '{path}' must end in .png")
+    mark = PngInfo()
+    mark.add_text("Software", MARK)
     with replacing(path) as temporary:
-        Image.fromarray(to_8bit(displayed)).save(temporary, format="PNG")
+        Image.fromarray(to_8bit(displayed)).save(temporary, format="PNG", pnginfo=mark)
 
 
 def to_8bit(displayed):

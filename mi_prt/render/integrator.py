@@ -1,5 +1,6 @@
 """The Mitsuba integrator `prt`: any sensor and film, lit from an asset in one ray per sample."""
 
+import os
 import warnings
 from functools import cache
 from pathlib import Path
@@ -12,6 +13,7 @@ from ..errors import SettingsError
 from ..lighting.environment import LightWarning
 from ..scene.scene import Scene, SceneSource
 from ..scene.traversal import digest_of
+from ..system.passing import pass_errors_through, remembered
 from ..system.runtime import VARIANTS, mitsuba
 from .direct_light import LocalEmitters
 from .repainted import is_repainted
@@ -43,6 +45,8 @@ def _register(variant):
 
     made = _plugin_class(variant) if variant in VARIANTS else _refused
     mi.register_integrator("prt", made)
+    if variant in VARIANTS:
+        pass_errors_through(mi)
 
 
 def _refused(properties):
@@ -92,8 +96,9 @@ def _plugin_class(variant):
 
         def __init__(self, properties, asset=None, irradiance=None, direct=None):
             super().__init__(properties)
-            self.asset = asset or _load(str(properties["filename"]))
-            self._direct = check_direct(direct or str(properties.get("direct", "points")))
+            with remembered():
+                self.asset = asset or _load(_filename(properties))
+                self._direct = check_direct(direct or str(properties.get("direct", "points")))
             self._follows_emitters = irradiance is None
             self._irradiance = None if irradiance is None else mi.Float(irradiance.ravel())
             self._scene = self._light = self._emitters = None
@@ -247,8 +252,16 @@ def integrator_for(asset, irradiance=None, direct="points"):
     return _plugin_class(mi.variant())(mi.Properties("prt"), asset, irradiance, direct)  # pyright: ignore[reportCallIssue]
 
 
+def _filename(properties):
+    if "filename" not in properties:
+        raise SettingsError(
+            "the integrator prt needs a filename: that of an asset (mi-prt precompute)"
+        )
+    return str(properties["filename"])
+
+
 def _load(filename):
     import mitsuba as mi
 
     found = Path(str(mi.file_resolver().resolve(filename)))  # pyright: ignore[reportCallIssue]
-    return load(found if found.exists() else filename)
+    return load(found if os.path.exists(found) else filename)

@@ -8,8 +8,11 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from ..errors import SceneError
-from ..system.runtime import a_worker_at_least, mitsuba
+from ..errors import PrtError, SceneError
+from ..system.files import why_no_file
+from ..system.passing import one_line
+from ..system.runtime import mitsuba
+from ..system.workers import a_worker_at_least
 from .bounds import bounds_of, scale_of, warn_if_far
 from .interactions import make_interactions
 from .mesh import mesh_arrays
@@ -228,11 +231,8 @@ def open_scene(source, parameters=None):
     if not isinstance(source, str | os.PathLike):
         raise SceneError(f"a scene is a path, a dict or an mi.Scene, got {type(source).__name__}")
     path = Path(source).absolute()
-    if not path.exists():
-        raise SceneError(f"scene '{path}' does not exist")
-    if not path.is_file():
-        what = "a folder" if path.is_dir() else "no regular file"
-        raise SceneError(f"scene '{path}' is {what}: give a Mitsuba XML file")
+    if reason := why_no_file(path):
+        raise SceneError(f"scene '{path}' {reason}: give a Mitsuba XML file")
     loaded = _loaded(f"scene '{path}'", mi.load_file, str(path), **parameters)
     return Scene(loaded, SceneSource("file", str(path), parameters, not Path(source).is_absolute()))
 
@@ -243,8 +243,12 @@ def _loaded(what, load, *arguments, **parameters):
     try:
         with a_worker_at_least():
             scene = load(*arguments, optimize=False, parallel=False, **parameters)
+    except PrtError:  # of a plugin of this package
+        raise
     except Exception as error:  # Mitsuba raises RuntimeError, ValueError and others
-        raise SceneError(f"Mitsuba rejects {what}: {' '.join(str(error).split())}") from None
+        text = one_line(error)
+        hint = " (or a film has no pixels)" if "field of view must" in text else ""
+        raise SceneError(f"Mitsuba rejects {what}: {text}{hint}") from None
     if not isinstance(scene, mitsuba().Scene):
         raise SceneError(f"{what} is a {type(scene).__name__}, not a scene")
     warn_if_far(scene)

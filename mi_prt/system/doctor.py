@@ -16,7 +16,7 @@ from pathlib import Path
 
 from packaging.requirements import Requirement
 
-from . import llvm, runtime
+from . import llvm, opengl, runtime
 
 TIME_LIMIT = 120
 """Seconds after which a probe counts as failed."""
@@ -35,21 +35,21 @@ hit = scene.ray_intersect(mi.Ray3f([0, 0, 5], [0, 0, -1]))
 mi.render(scene, spp=1).numpy()
 print(json.dumps({"variant": mi.variant(), "distance": float(hit.t[0]),
                   "threads": runtime.thread_count(), "embree": bool(mi.MI_ENABLE_EMBREE),
-                  "gpu": bool(dr.has_backend(dr.JitBackend.CUDA)),
+                  "gpu": bool(dr.has_backend(dr.JitBackend.CUDA)), "optix": runtime.cuda_usable(),
                   "llvm": runtime.versions()["llvm"]}))
 """
 
 _RASTER_PROBE = """
 import json
-from mi_prt.system import runtime
-pyrender = runtime.pyrender()
+from mi_prt.system import opengl
+pyrender = opengl.pyrender()
 renderer = pyrender.OffscreenRenderer(16, 16)
 from OpenGL.GL import GL_RENDERER, glGetString
 driver = glGetString(GL_RENDERER).decode()
 scene = pyrender.Scene(bg_color=[1.0, 1.0, 1.0, 1.0])
 scene.add(pyrender.PerspectiveCamera(yfov=1.0))
 color, _ = renderer.render(scene)
-print(json.dumps({"platform": runtime.raster_platform(), "driver": driver,
+print(json.dumps({"platform": opengl.raster_platform(), "driver": driver,
                   "background": int(color.min())}))
 """
 
@@ -110,7 +110,7 @@ def check_raster() -> Check:
         return _fault(
             "raster",
             complaint,
-            f"install a software renderer: `{runtime.raster_install_command()}`",
+            f"install a software renderer: `{opengl.raster_install_command()}`",
         )
     value = f"{found['platform']}: {found['driver']}"
     if found["background"] != 255:
@@ -258,13 +258,13 @@ def _embree(rays: dict) -> Check:
 
 
 def _cuda(rays: dict) -> Check:
-    if rays["variant"].startswith("cuda"):
-        return Check("cuda", "ok", "used")
-    if rays["gpu"]:
-        return Check(
-            "cuda",
-            "warning",
-            "a GPU, but its driver's OptiX (libnvoptix.so.1) is missing, so LLVM is used",
-            "install the complete driver; in a container set NVIDIA_DRIVER_CAPABILITIES=all",
-        )
-    return Check("cuda", "ok", "no GPU, LLVM is used")
+    if not rays["gpu"]:
+        return Check("cuda", "ok", "no GPU, LLVM is used")
+    if rays["optix"]:
+        return Check("cuda", "ok", "a GPU, used where it is asked for (--variant cuda_ad_rgb)")
+    return Check(
+        "cuda",
+        "warning",
+        "a GPU, but its driver's OptiX (libnvoptix.so.1) is missing, so only LLVM can be used",
+        "install the complete driver; in a container set NVIDIA_DRIVER_CAPABILITIES=all",
+    )

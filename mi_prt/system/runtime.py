@@ -1,5 +1,4 @@
-"""The one door to Mitsuba: variant, threads, kernel counts, versions, memory, and the OpenGL
-platform.
+"""The one door to Mitsuba: variant, threads, kernel counts, versions, memory.
 
 Mitsuba and Dr.Jit are imported inside these functions and nowhere at import time, so that `mi-prt
 --help` answers at once and a machine without a usable LLVM gets a typed error instead of an ended
@@ -14,24 +13,19 @@ import platform
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from ctypes.util import find_library
-from functools import cache
 from types import ModuleType
 
 from ..errors import RuntimeSetupError, SettingsError
 from .llvm import install_command, require_llvm, select_llvm
 
-VARIANTS = ("cuda_ad_rgb", "llvm_ad_rgb")
-"""Mitsuba variants that mi_prt works in, the preferred one first."""
+VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")
+"""Mitsuba variants that mi_prt works in, the default first; see docs/cuda.md for the other."""
 
 THREADS_PER_CORE = 8
 """Most threads per core that `set_threads` accepts: more only costs memory."""
 
 PACKAGES = ("mi_prt", "mitsuba", "drjit", "numpy", "scipy")
 """Distributions whose versions are stored with every result."""
-
-RASTER_PLATFORMS = ("osmesa", "egl")
-"""Values of `PYOPENGL_PLATFORM` that draw without a screen, the preferred one first."""
 
 _LIBATOMIC = {
     "apt-get": "libatomic1",
@@ -40,19 +34,12 @@ _LIBATOMIC = {
     "pacman": "gcc-libs",
 }
 
-_RASTER_PACKAGES = {
-    "apt-get": "libosmesa6",
-    "dnf": "mesa-libEGL mesa-dri-drivers libglvnd-opengl",
-    "zypper": "Mesa-libEGL1 Mesa-dri libglvnd",
-    "pacman": "mesa libglvnd",
-}
-
 
 def mitsuba() -> ModuleType:
     """The `mitsuba` module with a usable variant set.
 
-    A variant of `VARIANTS` that is already set is kept. Without one, `cuda_ad_rgb` is set where
-    Dr.Jit finds a GPU and OptiX, else `llvm_ad_rgb`.
+    A variant of `VARIANTS` that is already set is kept; without one `llvm_ad_rgb` is set, also
+    where there is a GPU.
 
     Raises
     ------
@@ -63,7 +50,7 @@ def mitsuba() -> ModuleType:
     mi = _load("mitsuba")
     variant = mi.variant()
     if variant is None:
-        variant = "cuda_ad_rgb" if cuda_usable() else "llvm_ad_rgb"
+        variant = VARIANTS[0]
     if variant not in VARIANTS:
         raise RuntimeSetupError(
             f"the Mitsuba variant {variant} is set, but mi_prt works in {' or '.join(VARIANTS)}; "
@@ -74,6 +61,28 @@ def mitsuba() -> ModuleType:
     if mi.variant() is None:
         mi.set_variant(variant)
     return mi
+
+
+def set_variant(variant: str) -> None:
+    """Set the variant that Mitsuba works in from here on.
+
+    Raises
+    ------
+    SettingsError
+        If it is not one of `VARIANTS`.
+    RuntimeSetupError
+        If this machine lacks what it needs.
+    """
+    if variant not in VARIANTS:
+        raise SettingsError(f"variant '{variant}' is not known: use {' or '.join(VARIANTS)}")
+    if variant.startswith("cuda") and not cuda_usable():
+        raise RuntimeSetupError(
+            f"the variant {variant} needs a GPU of NVIDIA, its driver and OptiX, one of which is"
+            f" not found here: install them, or use {VARIANTS[0]}"
+        )
+    if variant.startswith("llvm"):
+        require_llvm()
+    _load("mitsuba").set_variant(variant)
 
 
 def cuda_usable() -> bool:
@@ -129,20 +138,13 @@ def set_threads(count: int) -> None:
             f"threads must be an integer from 1 to {most} ({THREADS_PER_CORE} per core), got"
             f" {count!r}"
         )
-    _load("drjit").set_thread_count(count)
+    set_thread_count(count)
 
 
-@contextmanager
-def a_worker_at_least():
-    """Within the block Dr.Jit has a thread beside the calling one: Mitsuba hands the loading of
-    images to it, and waits forever without.
-    """
+def set_thread_count(count: int) -> None:
+    """`set_threads`, unchecked."""
     drjit = _load("drjit")
-    count = drjit.thread_count()
-    drjit.set_thread_count(max(count, 2))
-    try:
-        yield
-    finally:
+    if drjit.thread_count() != count:
         drjit.set_thread_count(count)
 
 
@@ -239,72 +241,6 @@ def package_version(package: str) -> str:
         return "none"
 
 
-def raster_platform() -> str:
-    """Choose how pyrender opens OpenGL without a screen, by setting `PYOPENGL_PLATFORM`; call it
-    before using pyrender.
-
-    A variable that is already set is kept. Else OSMesa is taken if its library is installed,
-    because it needs no driver and draws the same everywhere, else EGL.
-
-    Returns
-    -------
-    str
-        "osmesa" or "egl".
-
-    Raises
-    ------
-    RuntimeSetupError
-        If neither library is installed, if the variable names another platform or one that is not
-        installed, or if PyOpenGL was imported before with another platform.
-    """
-    installed = [name for name in RASTER_PLATFORMS if _installed(name)]
-    chosen = os.environ.get("PYOPENGL_PLATFORM") or next(iter(installed), None)
-    if chosen is None:
-        raise RuntimeSetupError(
-            "neither OSMesa nor EGL is installed, one of which draws without a screen; install it "
-            f"with `{raster_install_command()}`"
-        )
-    if chosen not in installed:
-        raise RuntimeSetupError(
-            f"PYOPENGL_PLATFORM is {chosen}, but what draws without a screen here is "
-            f"{' or '.join(installed) or 'nothing'}; unset it, or install a platform with "
-            f"`{raster_install_command()}`"
-        )
-    loaded = sys.modules.get("OpenGL.platform")
-    name = type(loaded.PLATFORM).__name__ if loaded else ""
-    if loaded and not name.lower().startswith(chosen):
-        raise RuntimeSetupError(
-            f"PyOpenGL was imported before mi_prt and took {name}, but {chosen} is needed; import "
-            f"OpenGL and pyrender after mi_prt, or start with PYOPENGL_PLATFORM={chosen}"
-        )
-    os.environ["PYOPENGL_PLATFORM"] = chosen
-    return chosen
-
-
-def pyrender() -> ModuleType:
-    """The `pyrender` module, ready to draw without a screen on `raster_platform`.
-
-    Its window class is left out: importing it needs X11 libraries, which servers lack and drawing
-    off screen does not use.
-
-    Raises
-    ------
-    RuntimeSetupError
-        As `raster_platform` does.
-    """
-    raster_platform()
-    if "pyrender" not in sys.modules:
-        viewer = ModuleType("pyrender.viewer")
-        viewer.Viewer = None  # pyright: ignore[reportAttributeAccessIssue]
-        sys.modules["pyrender.viewer"] = viewer
-    return importlib.import_module("pyrender")
-
-
-def raster_install_command() -> str:
-    """What to type to install a library that draws without a screen."""
-    return install_command(_RASTER_PACKAGES)
-
-
 def _load(module: str) -> ModuleType:
     """Import drjit or mitsuba after the choice of an LLVM; whatever prevents that becomes a typed
     error.
@@ -320,16 +256,6 @@ def _load(module: str) -> ModuleType:
         raise RuntimeSetupError(
             f"{module} cannot be imported ({cause}); type `{remedy}`"
         ) from error
-
-
-@cache
-def _installed(platform: str) -> bool:
-    """Whether a raster platform's libraries are there; asked once, because each takes a process to
-    find.
-    """
-    if platform == "osmesa":
-        return find_library("OSMesa") is not None
-    return find_library("EGL") is not None and any(map(find_library, ("OpenGL", "GL")))
 
 
 def _optix_loadable() -> bool:

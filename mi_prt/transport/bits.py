@@ -6,6 +6,7 @@
 import numpy as np
 
 from ..basis.transport_rows import DirectTransport
+from ..system.arrays import packets
 from ..system.runtime import mitsuba
 
 LANES = 1 << 22  # rays of a wavefront: a few million keep both cores busy in a few hundred MB
@@ -81,7 +82,6 @@ class VisibilityTracer:
     """
 
     def __init__(self, scene, points, vectors):
-        mi = mitsuba()
         self.occluders = scene.occluders
         self.lanes_per_point = len(vectors)
         # Rays start on the side of the surface that reflects, and off its rim. One that dips below
@@ -89,7 +89,7 @@ class VisibilityTracer:
         # blocked, as it is in Mitsuba's own rendering.
         origins = points.ray_origins(RAY_OFFSET * scene.scale)
         self._vectors, self._origins, self._normals = (
-            mi.Float(np.pad(x, ((0, 0), (0, 1))).ravel())  # 4 floats each: gathered in one load
+            packets(np.pad(x, ((0, 0), (0, 1))))  # 4 floats each: gathered in one load
             for x in (vectors, origins, points.normals)
         )
 
@@ -104,10 +104,10 @@ class VisibilityTracer:
             return mi.Vector3f(v.x, v.y, v.z)
 
         lane = dr.arange(mi.UInt32, size * self.lanes_per_point)
-        # the divisor is the same in all blocks, so it may be a literal
-        local = lane // self.lanes_per_point
+        per_point = dr.opaque(mi.UInt32, self.lanes_per_point)
+        local = lane // per_point
         point = local + dr.opaque(mi.UInt32, first)
-        direction = vectors(self._vectors, lane - local * self.lanes_per_point)
+        direction = vectors(self._vectors, lane - local * per_point)
         above = dr.mulsign(direction, dr.dot(vectors(self._normals, point), direction))
         return mi.Ray3f(vectors(self._origins, point), above)
 
@@ -190,9 +190,14 @@ def _all_inside(scene, points, vectors):
     toward = np.tile(vectors, (len(points), 1))
     toward *= np.where(np.sum(toward * normals, axis=1) < 0, -1, 1)[:, None].astype(np.float32)
     origins = points.ray_origins(RAY_OFFSET * scene.scale)
-    ray = mi.Ray3f(mi.Point3f(np.repeat(origins, count, axis=0).T), mi.Vector3f(toward.T))
+    lane = dr.arange(mi.UInt32, len(toward))  # gathered: arrays read lane by lane compile anew
+    point = lane // dr.opaque(mi.UInt32, count)
+    ray = mi.Ray3f(
+        dr.gather(mi.Point3f, mi.Float(origins.ravel()), point),
+        dr.gather(mi.Vector3f, mi.Float(toward.ravel()), lane),
+    )
     hit = scene.intersect(ray)
     near = np.minimum(1e-3 * scene.scale, 0.1 * np.sqrt(points.areas)).astype(np.float32)
-    near = mi.Float(np.repeat(near, count))
+    near = dr.gather(mi.Float, mi.Float(near), point)
     inside = hit.is_valid() & ((dr.dot(hit.n, ray.d) > 0) | (hit.t < near))
     return np.array(inside).reshape(-1, count).all(axis=1)

@@ -13,6 +13,7 @@ import scipy.sparse
 
 from ..directions.hemisphere import frame_of, frames
 from ..scene.materials import facing, reflectance_at
+from ..system.arrays import packets
 from ..system.parallel import map_chunks
 from ..system.runtime import mitsuba
 from .bits import LANES, RAY_OFFSET
@@ -64,7 +65,7 @@ class HemisphereTracer:
         self._channels = channels
         self._locator = points.locator(scene)
         self._rank = mi.UInt32(clusters.rank.astype(np.uint32))
-        self._vectors = mi.Float(np.pad(hemisphere.vectors, ((0, 0), (0, 1))).ravel())
+        self._vectors = packets(np.pad(hemisphere.vectors, ((0, 0), (0, 1))))
         self._origins = mi.Float(
             points.at(clusters.order).ray_origins(RAY_OFFSET * scene.scale).ravel()
         )
@@ -94,8 +95,9 @@ class HemisphereTracer:
         mi = mitsuba()
         size, count = len(rotations), len(self._hemisphere)
         lane = dr.arange(mi.UInt32, size * count)
-        local = lane // count
-        v = dr.gather(mi.Vector4f, self._vectors, lane - local * count)
+        per_point = dr.opaque(mi.UInt32, count)
+        local = lane // per_point
+        v = dr.gather(mi.Vector4f, self._vectors, lane - local * per_point)
         rows = mi.Float(np.ascontiguousarray(rotations, np.float32).ravel())
         x, y, z = (dr.gather(mi.Vector3f, rows, 3 * local + i) for i in range(3))
         direction = mi.Vector3f(*(a.x * v.x + a.y * v.y + a.z * v.z for a in (x, y, z)))

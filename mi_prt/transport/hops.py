@@ -217,7 +217,8 @@ class HopSampler:
         # each size. And they are gathered from: those that are read lane by lane compile another
         # kernel where their memory is aligned otherwise.
         lane = dr.arange(mi.UInt32, lanes)
-        local = lane // self._rays
+        rays = dr.opaque(mi.UInt32, self._rays)
+        local = lane // rays
         owner = dr.gather(mi.UInt32, mi.UInt32(index.astype(np.uint32)), local)
         origin = dr.gather(mi.Point3f, self._origins, owner)
         ray = mi.Ray3f(origin, dr.gather(mi.Vector3f, mi.Float(directions.ravel()), lane))
@@ -226,9 +227,7 @@ class HopSampler:
         si = self._scene.interaction(pi, ray, active)
         _, si.wi, reflects = facing(si, ray, self._scene.surfaces)
         # The number is hashed from point and ray, so that it depends on nothing else.
-        number = (
-            lane - local * self._rays + dr.opaque(mi.UInt32, self._seed * self._rays % (1 << 32))
-        )
+        number = lane - local * rays + dr.opaque(mi.UInt32, self._seed * self._rays % (1 << 32))
         random = mi.sample_tea_float32(owner, number)
         active &= si.is_valid() & reflects
         point, found = self._locator.picked(pi, si, ray, active, random)

@@ -25,6 +25,7 @@ FAR_FROM_WHITE = 0.9  # albedo up to which a bound by albedo alone says enough
 ALBEDO_ROUNDING = 1e-4
 LEAST_RAYS = 8  # of a point, to which the rays of late reflections are thinned
 COLUMNS = 32  # coefficients worked on at a time; fixed, so that results do not depend on memory
+LARGEST_GROWTH = 1e12  # of light by reflections
 
 
 @dataclass(frozen=True)
@@ -85,12 +86,8 @@ def split_by_bounces(hops, direct, weights, channels, bounces=None):
     while len(energy) <= (MOST_COUNTED_BOUNCES if bounces is None else bounces):
         term = hops.apply(term)
         energy.append(_mean(term, weights))
-        if not np.isfinite(energy[-1]):
-            raise SceneError(
-                f"light grows without bound within {len(energy) - 1} reflections: a surface"
-                f" reflects {albedo:.4g} times the light that arrives at it; correct its"
-                " reflectance, or use fewer bounces (--bounces)"
-            )
+        if energy[0] > 0:
+            check_growth(energy[-1] / energy[0], len(energy) - 1, albedo)
         # A reflection leaves at most the largest albedo of the flux that arrives at all surfaces,
         # and a mean weighted by area is flux. Where that is nearly all, the bound is of no use, and
         # what all reflections come to is solved for.
@@ -111,6 +108,18 @@ def check_ending(albedo):
         raise SceneError(
             f"a surface reflects {albedo:.4g} times the light that arrives at it, so reflections"
             " need not end: correct its reflectance, or give a number of bounces (--bounces)"
+        )
+
+
+def check_growth(growth, number, albedo):
+    """Raise SceneError where a number of reflections has made light grow more than
+    `LARGEST_GROWTH`: squares of it would soon be more than float32 holds.
+    """
+    if not (np.asarray(growth) <= LARGEST_GROWTH).all():
+        raise SceneError(
+            f"light grows without bound within {number:,} reflections: a surface reflects"
+            f" {albedo:.4g} times the light that arrives at it; correct its reflectance, or use"
+            " fewer bounces (--bounces)"
         )
 
 

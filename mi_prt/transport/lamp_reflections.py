@@ -22,6 +22,7 @@ from .interreflection import (
     ROUNDING,
     _converged,
     check_ending,
+    check_growth,
 )
 from .lamp_rays import AIMED, LampRays
 from .lamp_table import Lamps
@@ -154,6 +155,8 @@ def _after_reflections(hops, gather, weights, bounces):
         if albedo > FAR_FROM_WHITE:
             return gather + _converged(hops, gather), None
     total, term, number = gather.copy(), gather, 1
+    started = np.einsum("cnm,n->m", gather, weights, dtype=np.float64)
+    lit = started > 0
     most = MOST_SUMMED_BOUNCES if bounces is None else bounces
     while number < most:
         term = hops.apply(term)
@@ -161,6 +164,7 @@ def _after_reflections(hops, gather, weights, bounces):
         number += 1
         # A reflection leaves at most the largest albedo of the flux.
         flux, whole = (np.einsum("cnm,n->m", x, weights, dtype=np.float64) for x in (term, total))
+        check_growth(whole[lit] / started[lit], number, albedo)
         left = flux * albedo / (1 - albedo) if albedo < 1 else np.inf * flux
         if (left <= (BOUNCE_TOLERANCE if bounces is None else ROUNDING) * whole).all():
             return total, number

@@ -11,6 +11,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ..lighting.places import Places
+from ..system.arrays import packets
 from ..system.runtime import mitsuba
 from .examples import raised_height
 from .hemispheres import cluster_frames
@@ -61,8 +62,8 @@ class LocalDirect:
         self._groups = -(-depth.coefficients.shape[1] // 4)
         extra = 4 * self._groups - depth.coefficients.shape[1]
         self._means = mi.Float(depth.means.ravel())
-        self._vectors = mi.Float(np.pad(depth.vectors, ((0, 0), (0, 0), (0, extra))).ravel())
-        self._coefficients = mi.Float(np.pad(depth.coefficients, ((0, 0), (0, extra))).ravel())
+        self._vectors = packets(np.pad(depth.vectors, ((0, 0), (0, 0), (0, extra))))
+        self._coefficients = packets(np.pad(depth.coefficients, ((0, 0), (0, extra))))
         self._labels = mi.UInt32(clusters.labels.astype(np.uint32))
         rotations = np.concatenate(
             [cluster_frames(points.normals[cluster]) for cluster in clusters.slices]
@@ -71,7 +72,7 @@ class LocalDirect:
             np.pad(axis, ((0, 0), (0, 1)))
             for axis in np.moveaxis(rotations.astype(np.float32), 2, 0)
         )
-        self._points = mi.Float(np.hstack([points.positions, points.areas[:, None], *axes]).ravel())
+        self._points = packets(np.hstack([points.positions, points.areas[:, None], *axes]))
         self._far = dr.opaque(mi.Float, FAR * depth.extent)
         self._cell = dr.opaque(mi.Float, CELLS * (2 * np.pi / self._directions) ** 0.5)
 
@@ -186,7 +187,8 @@ class LocalDirect:
             dr.gather(mi.Vector4f, self._coefficients, point * self._groups + i)
             for i in range(self._groups)
         ]
-        cluster = dr.gather(mi.UInt32, self._labels, point) * self._directions
+        cluster = dr.gather(mi.UInt32, self._labels, point)
+        cluster *= dr.opaque(mi.UInt32, self._directions)
         visible = mi.Float(0)
         for index, share in zip(*self._hemisphere.around(local)):
             entry = cluster + index

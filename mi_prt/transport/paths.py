@@ -138,9 +138,10 @@ class PathSampler:
         mi = mitsuba()
         width = len(index) * self._paths
         lane = dr.arange(mi.UInt32, width)
-        local = lane // self._paths
+        paths = dr.opaque(mi.UInt32, self._paths)
+        local = lane // paths
         owner = dr.gather(mi.UInt32, mi.UInt32(index.astype(np.uint32)), local)
-        number = lane - local * self._paths
+        number = lane - local * paths
         state = mi.sample_tea_32(owner, number + self._seed * 0x9E3779B9)
         random = mi.PCG32(initstate=mi.UInt64(state[0]), initseq=mi.UInt64(state[1]))
         # First directions of a point are stratified: a low-discrepancy sequence, shifted at random

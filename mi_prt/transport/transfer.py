@@ -19,6 +19,7 @@ import numpy as np
 from ..basis.clustered import leading_components
 from ..errors import SceneError
 from ..system.parallel import map_chunks
+from .interreflection import LARGEST_GROWTH
 
 MOST_REFLECTIONS = 0.9999  # spectral radius of one hop from which on reflections do not end
 _POWER_STEPS = 200
@@ -107,25 +108,42 @@ def all_reflections(hop, bounces=None):
     Raises
     ------
     SceneError
-        If reflections do not end because nothing is lost in them.
+        If reflections do not end because nothing is lost in them, or light grows by more than
+        `LARGEST_GROWTH` within that number.
     """
-    size = len(hop)
     result = np.empty_like(hop)
     for channel in range(hop.shape[2]):
         one = hop[..., channel]
-        if bounces is None:
-            if _spectral_radius(one) >= MOST_REFLECTIONS:
-                raise SceneError(
-                    "light that is reflected grows without bound: lower the albedo, or ask for a"
-                    " number of bounces"
-                )
-            result[..., channel] = np.linalg.inv(np.eye(size) - one)
-            continue
-        total = np.eye(size)
-        for _ in range(bounces - 1):
-            total = np.eye(size) + one @ total
-        result[..., channel] = total
+        result[..., channel] = _endless(one) if bounces is None else _summed(one, bounces)
     return result
+
+
+def _endless(one):
+    """1 + B + B² + …, all of them."""
+    if _spectral_radius(one) >= MOST_REFLECTIONS:
+        raise SceneError(
+            "light that is reflected grows without bound: lower the albedo, or ask for a number of"
+            " bounces (--bounces)"
+        )
+    return np.linalg.inv(np.eye(len(one)) - one)
+
+
+def _summed(one, count):
+    """1 + B + … of so many terms, by doubling their number: S₂ₙ = Sₙ + BⁿSₙ."""
+    total, power = np.eye(len(one)), one  # of one term
+    with np.errstate(over="ignore", invalid="ignore"):
+        for bit in bin(count)[3:]:
+            total, power = total + power @ total, power @ power
+            if bit == "1":
+                total, power = np.eye(len(one)) + one @ total, one @ power
+        largest = np.abs(total).max()
+    if not largest <= LARGEST_GROWTH:
+        raise SceneError(
+            f"light grows without bound within {count:,} reflections: each returns"
+            f" {_spectral_radius(one):.4g} times the light that arrives; lower the albedo, or use"
+            " fewer bounces (--bounces)"
+        )
+    return total
 
 
 def _spectral_radius(matrix):
