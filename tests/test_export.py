@@ -2,6 +2,7 @@
 not there.
 """
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,9 +13,10 @@ from PIL import Image
 
 from mi_prt.errors import SettingsError
 from mi_prt.output import npz, ply
+from mi_prt.points.filled import filled
 from mi_prt.points.points import sample_points
 from mi_prt.render import image_file
-from mi_prt.render.display import display, exposure
+from mi_prt.render.display import display
 from mi_prt.scene.scene import open_scene
 from mi_prt.system.runtime import mitsuba
 
@@ -62,13 +64,13 @@ def columns(vertex, names):
 
 def test_ply_holds_points_and_radiance(asset, radiance, tmp_path):
     path = tmp_path / "points.ply"
-    ply.write_ply(path, asset, radiance)
+    ply.write_ply(path, asset, radiance, 0.3)
     vertex, face = read_ply(path)
     np.testing.assert_array_equal(columns(vertex, "x y z"), asset.points.positions)
     np.testing.assert_array_equal(columns(vertex, "nx ny nz"), asset.points.normals)
     np.testing.assert_array_equal(columns(vertex, "radiance_r radiance_g radiance_b"), radiance)
     np.testing.assert_array_equal(face, asset.points.layout.triangles())
-    shown = display(radiance, exposure(radiance[~asset.buried]))
+    shown = display(radiance, 0.3)
     np.testing.assert_allclose(
         columns(vertex, "red green blue") / 255, shown, atol=0.5 / 255 + 1e-6
     )
@@ -80,7 +82,7 @@ def test_mitsuba_reads_the_ply(asset, radiance, tmp_path):
     """
     mi = mitsuba()
     path = tmp_path / "points.ply"
-    ply.write_ply(path, asset, radiance)
+    ply.write_ply(path, asset, radiance, 0.3)
     mesh = mi.load_dict({"type": "ply", "filename": str(path)})
     parameters = mi.traverse(mesh)
     np.testing.assert_array_equal(np.array(parameters["vertex_radiance_color"]), radiance.ravel())
@@ -98,7 +100,7 @@ def test_mitsuba_reads_the_ply(asset, radiance, tmp_path):
 def test_trimesh_reads_the_ply(asset, radiance, tmp_path):
     trimesh = pytest.importorskip("trimesh")
     path = tmp_path / "points.ply"
-    ply.write_ply(path, asset, radiance)
+    ply.write_ply(path, asset, radiance, 0.3)
     mesh = trimesh.load(path, process=False)
     vertex, face = read_ply(path)
     np.testing.assert_allclose(mesh.vertices, asset.points.positions)
@@ -119,6 +121,7 @@ def test_npz_holds_plain_arrays(asset, radiance, tmp_path):
         "normals": points.normals,
         "albedo": points.albedo,
         "areas": points.areas,
+        "buried": points.buried,
         "triangles": points.layout.triangles(),
         "irradiance": irradiance,
         "radiance": radiance,
@@ -188,7 +191,7 @@ def test_unusable_paths_are_refused(asset, radiance, tmp_path):
     for write in (
         lambda path: image_file.write_image(path.with_suffix(".exr"), image),
         lambda path: image_file.write_image(path.with_suffix(".png"), image),
-        lambda path: ply.write_ply(path, asset, radiance),
+        lambda path: ply.write_ply(path, asset, radiance, 0.3),
         lambda path: npz.write_npz(path, asset, radiance, radiance),
     ):
         with pytest.raises(SettingsError, match="create it first"):
@@ -203,3 +206,27 @@ def test_files_get_the_usual_permissions(tmp_path):
     (tmp_path / "usual").touch()
     image_file.write_image(tmp_path / "image.png", np.zeros((2, 2, 3)))
     assert (tmp_path / "image.png").stat().st_mode == (tmp_path / "usual").stat().st_mode
+
+
+def test_buried_points_are_exported_with_their_neighbours_light():
+    """Each has the value of the nearest free one on its side of its surface, by brute force;
+    without any free one it stays as it is.
+    """
+    parts = scene(
+        plate={"type": "rectangle", "bsdf": {"type": "twosided", "bsdf": {"type": "diffuse"}}},
+        box=cube((0, 0, 0), 0.4),
+    )
+    points = sample_points(open_scene(parts), 0.25)
+    inside = (points.surface == 0) & (np.abs(points.positions[:, :2]).max(axis=1) < 0.4)
+    points = replace(points, buried=inside | (points.surface == 1))
+    values = np.random.default_rng(0).random((len(points), 3)).astype(np.float32)
+    found = filled(points, values)
+    assert found.dtype == values.dtype and inside.sum() > 4
+    np.testing.assert_array_equal(found[~inside], values[~inside])
+    for i in np.flatnonzero(inside):
+        free = ~points.buried & (points.normals @ points.normals[i] > 0) & (points.surface == 0)
+        distance = np.linalg.norm(points.positions - points.positions[i], axis=1)
+        nearest = free & (distance < distance[free].min() + 1e-6)
+        assert (found[i] == values[nearest]).all(axis=1).any()
+    free = replace(points, buried=np.zeros_like(points.buried))
+    assert filled(free, values) is values

@@ -14,6 +14,7 @@ from .options import (
     Define,
     Direct,
     Environment,
+    Exposure,
     Force,
     Frames,
     FramesPerSecond,
@@ -206,6 +207,7 @@ def relight(
     ] = None,
     frames: Frames = None,
     fps: FramesPerSecond = None,
+    exposure: Exposure = "auto",
     scene: OtherScene = None,
     force: Force = False,
     threads: Threads = None,
@@ -233,6 +235,7 @@ def relight(
         "direct": direct,
         "rotate": turned,
         "force": force,
+        "exposure": exposure,
     }
     film = {k: v for k, v in (("frames", frames), ("fps", fps)) if v is not None}
     if light_path is not None:

@@ -72,6 +72,15 @@ Direct = Annotated[
         help="Direct light of lamps at the points, or by shadow rays at pixels.",
     ),
 ]
+Exposure = Annotated[
+    str,
+    typer.Option(
+        "--exposure",
+        metavar="EV|auto",
+        help="Of displayed pictures: 0 shows radiance 1 as white, one more twice the light; auto:"
+        " mid grey on average, for a film that of its first frame.",
+    ),
+]
 Nearest = Annotated[
     int | None,
     typer.Option(

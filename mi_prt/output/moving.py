@@ -7,7 +7,7 @@ from typing import Any
 from ..asset.provenance import open_scene_of
 from ..errors import LightError
 from ..lighting.light import Light
-from ..render.display import display
+from ..render.display import display, exposure_report
 from ..render.integrator import check_direct
 from ..render.picture import RENDERERS, Picture
 from ..render.rendered import check_picture
@@ -33,6 +33,7 @@ def animate(
     direct="points",
     progress=lambda stage, done, total, detail="": None,
     rotate=None,
+    exposure="auto",
     force=False,
 ):
     """Move the first local light along a path, and write a frame for each place of it.
@@ -46,7 +47,7 @@ def animate(
     frames, fps : int
     light : what `as_light` accepts, or a list of such
         Whose first point, spot or area light moves; all else stays.
-    scene, sensor, size, renderer, spp, component, direct, rotate, force :
+    scene, sensor, size, renderer, spp, component, direct, rotate, exposure, force :
         As of `relight_to_file`.
     progress : callable(stage, done, total, detail)
 
@@ -64,7 +65,12 @@ def animate(
     opened = open_scene_of(asset, scene)
     moving = _Moving(asset.resolved(light, rotate, opened))
     first = moving.at(places[0])
-    film = _Film(Picture(asset, opened, first, component, direct), moving, progress, frames)
+    film = _Film(
+        Picture(asset, opened, first, component, direct, exposure=exposure),
+        moving,
+        progress,
+        frames,
+    )
     # A light that is a shape is seen: what is drawn changes with its place.
     runs = [[place] for place in places] if moving.part.is_shape else [places]
 
@@ -77,7 +83,12 @@ def animate(
 
     write_frames(output, pictures(), fps)
     seconds = {name: round(value, 5) for name, value in film.seconds.items()}
-    return {"points": len(asset.points), "frames": frames, "seconds": seconds}
+    return {
+        "points": len(asset.points),
+        "frames": frames,
+        "exposure": exposure_report(film.factor),
+        "seconds": seconds,
+    }
 
 
 class _Moving:

@@ -21,8 +21,8 @@ class Npz(Format):
 
 
 def write_npz(path, asset, radiance, irradiance):
-    """Write the points as plain arrays: positions, normals, albedo, areas, triangles, irradiance
-    and radiance.
+    """Write the points as plain arrays: positions, normals, albedo, areas, buried, triangles,
+    irradiance and radiance.
 
     Parameters
     ----------
@@ -46,6 +46,7 @@ def write_npz(path, asset, radiance, irradiance):
             normals=points.normals,
             albedo=points.albedo,
             areas=points.areas,
+            buried=points.buried,
             triangles=points.layout.triangles(),
             irradiance=irradiance,
             radiance=radiance,

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ..render.display import display, exposure
+from ..render.display import display
 from ..render.image_file import to_8bit
 from ..system.files import MARK, replacing
 from .formats import FORMATS, Format
@@ -19,10 +19,10 @@ class Ply(Format):
     @classmethod
     def write(cls, path, relit):
         """See `Format.write`."""
-        write_ply(path, relit.asset, relit.radiance)
+        write_ply(path, relit.asset, relit.radiance, relit.exposure)
 
 
-def write_ply(path, asset, radiance):
+def write_ply(path, asset, radiance, factor):
     """Write the points with their radiance as a binary PLY mesh.
 
     Each vertex has x y z, nx ny nz, linear radiance as `radiance_r radiance_g radiance_b` (float),
@@ -37,6 +37,8 @@ def write_ply(path, asset, radiance):
     asset : Asset
     radiance : (n, 3)
         W/(m²·sr) at the asset's points.
+    factor : float
+        Exposure of red, green and blue, see `display`.
 
     Raises
     ------
@@ -44,7 +46,7 @@ def write_ply(path, asset, radiance):
         If the path cannot be written.
     """
     points, radiance = asset.points, np.asarray(radiance)
-    shown = to_8bit(display(radiance, exposure(radiance[~asset.buried])))
+    shown = to_8bit(display(radiance, factor))
     columns = {}
     for names, values in {
         ("x", "y", "z"): points.positions,

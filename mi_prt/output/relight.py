@@ -7,12 +7,14 @@ from ..asset.provenance import open_scene_of
 from ..errors import SettingsError
 from ..lighting.environment import LightWarning
 from ..lighting.light import Light
-from ..render.display import exposure
+from ..points.filled import filled
+from ..render.display import check_exposure, exposure_factor, exposure_report
 from ..render.integrator import check_direct
 from ..render.picture import RENDERERS, Picture
 from ..render.rendered import check_picture
 from ..system.files import check_own, check_writable
 from ..transport.transport import Question
+from .dark import dark_warning
 from .formats import FORMATS, Relit, format_of
 
 
@@ -30,6 +32,7 @@ def relight_to_file(
     component="total",
     direct="points",
     force=False,
+    exposure="auto",
 ):
     """Relight an asset and write the result.
 
@@ -60,11 +63,14 @@ def relight_to_file(
         pixel.
     force : bool
         Whether to replace a file that this program has not written.
+    exposure : 'auto' or float
+        Of .png and .ply: EV (0 shows radiance 1 as white), or what takes the log-average luminance
+        at the points to mid grey.
 
     Returns
     -------
     dict
-        points, seconds{relight, render}.
+        points, exposure{ev, factor}, seconds{relight, render}.
 
     Raises
     ------
@@ -74,11 +80,12 @@ def relight_to_file(
     -----
     LightWarning
         If a local light is inside the convex hull of the scene and only transport of distant light
-        is there for it. `compare` measures its error.
+        is there for it; `compare` measures its error. If light gives the scene almost nothing.
     """
     written = format_of(output)
     RENDERERS[renderer]
     check_picture(size, sensor, spp)
+    exposure = check_exposure(exposure)
     Question(Light(()), component, nearest)  # which checks them
     if check_direct(direct) == "pixels" and not written.is_picture:
         pictures = " or ".join(name for name in FORMATS if FORMATS[name].is_picture)
@@ -92,7 +99,7 @@ def relight_to_file(
     resolved = asset.resolved(light, rotate, opened or scene)
     clock = [time.perf_counter()]
     if written.is_picture:
-        picture = Picture(asset, opened, resolved, component, direct, nearest)
+        picture = Picture(asset, opened, resolved, component, direct, nearest, exposure)
         irradiance = picture.irradiance()
         clock.append(time.perf_counter())
         with picture.drawn(sensor, size, renderer, spp) as draw:
@@ -100,17 +107,21 @@ def relight_to_file(
         relit = Relit(asset, irradiance, None, picture.exposure(), image)
     else:
         shares = asset.shared_out(resolved)
-        irradiance = asset.answered(shares, component, nearest)
+        irradiance = filled(asset.points, asset.answered(shares, component, nearest))
         radiance = asset.outgoing_radiance(irradiance)
         clock.append(time.perf_counter())
-        relit = Relit(asset, irradiance, radiance, exposure(radiance[~asset.buried]))
+        factor = exposure_factor(exposure, radiance[~asset.buried])
+        relit = Relit(asset, irradiance, radiance, factor)
     written.write(output, relit)
     clock.append(time.perf_counter())
     seconds = zip(("relight", "render"), clock, clock[1:])
     for warning in asset.warnings(asset.shared_out(resolved)):
         text = f"{warning}; compare tells how far such light is off (mi-prt compare)"
         warnings.warn(text, LightWarning, stacklevel=2)
+    if component != "indirect" and (dark := dark_warning(asset.points, irradiance, resolved)):
+        warnings.warn(dark, LightWarning, stacklevel=2)
     return {
         "points": len(asset.points),
+        "exposure": exposure_report(relit.exposure),
         "seconds": {name: round(b - a, 5) for name, a, b in seconds},
     }

@@ -5,7 +5,7 @@ from contextlib import contextmanager
 from ..lighting.to_mitsuba import lit_scene
 from ..scene.scene import Scene
 from ..system.registry import Registry
-from .display import exposure
+from .display import check_exposure, exposure_factor
 from .image import pick_sensor, render_image, resized
 from .integrator import check_direct
 
@@ -27,9 +27,21 @@ class Picture:
         Whether direct light of local lights is computed at the points or at each pixel.
     nearest : int, optional
         See `Asset.irradiance`.
+    exposure : 'auto' or float
+        Of displayed pictures: EV, or what takes their log-average luminance to mid grey.
     """
 
-    def __init__(self, asset, scene, light, component="total", direct="points", nearest=None):
+    def __init__(
+        self,
+        asset,
+        scene,
+        light,
+        component="total",
+        direct="points",
+        nearest=None,
+        exposure: float | str = "auto",
+    ):
+        self._exposure = check_exposure(exposure)
         self.asset, self._opened = asset, scene
         self._component, self._nearest = component, nearest
         self._at_pixels = check_direct(direct) == "pixels" and component != "indirect"
@@ -74,7 +86,9 @@ class Picture:
     def exposure(self):
         """Factor for displaying pictures, from the radiance at the points."""
         shown = ~self.asset.buried
-        return exposure(self.asset.outgoing_radiance(self.at_points())[shown])
+        return exposure_factor(
+            self._exposure, self.asset.outgoing_radiance(self.at_points())[shown]
+        )
 
     def lit(self):
         """The Scene as it is seen: under its light."""
