@@ -2,7 +2,7 @@
 
 import warnings
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +15,7 @@ from ..points.points import Points
 from ..transport.ledger import Entry
 from ..transport.transport import COMPONENTS, TRANSPORTS, Question
 from . import file
+from .batch import batch_irradiance
 from .provenance import open_scene_of, scene_is_open
 
 
@@ -84,15 +85,19 @@ class Asset:
         SettingsError
             If there is no distant light to turn.
         """
+        return self._resolved(light, rotate, scene, cache(lambda: open_scene_of(self, scene)))
+
+    def _resolved(self, light, rotate, scene, opened):
+        """See `resolved`; `opened` gives the Scene."""
         if light is None:
             light = self._own_light()
         names = {emitter["name"]: emitter["distant"] for emitter in self.emitters}
         if scene_is_open(scene):
             light = resolve(light, scene)
         else:
-            light = resolve(light, lambda: open_scene_of(self, scene), names)
+            light = resolve(light, opened, names)
             if any(map(self._needs_scene, light.parts)):
-                light = resolve(light, open_scene_of(self, scene))
+                light = resolve(light, opened())
         if rotate is None:
             return light
         if light.distant.is_empty:
@@ -101,6 +106,11 @@ class Asset:
                 " (--rotate)"
             )
         return light.rotated(*rotate)
+
+    def resolved_all(self, lights):
+        """Each of several lights resolved, a list of `Light`; the scene is opened once at most."""
+        opened = cache(lambda: open_scene_of(self))
+        return [self._resolved(light, None, None, opened) for light in lights]
 
     def _own_light(self):
         """The scene's own light, as far as the asset holds it."""
@@ -216,8 +226,11 @@ class Asset:
 
     # --- relighting ---------------------------------------------------------------------------
 
-    def irradiance(self, light=None, component="total", nearest=None):
+    def irradiance(self, light=None, component="total", nearest=None, *, batch=False):
         """Irradiance at the points.
+
+        >>> asset.irradiance([sky, sun])  # their sum, (n, 3)
+        >>> asset.irradiance(maps, batch=True)  # each alone, (m, n, 3): one matrix product
 
         Parameters
         ----------
@@ -229,16 +242,18 @@ class Asset:
             Directions that stand for a local light where transport is for distant light only
             (Eigentransport, section 4.2.1); by default the three around its own, in shares that
             keep its direction.
+        batch : bool
+            Whether `light` is a list of m lights (or of lists, their sums), each asked for alone.
 
         Returns
         -------
-        (n, 3) float32
+        (n, 3) float32, or (m, n, 3) of a batch
             W/m².
 
         Raises
         ------
         LightError
-            If no transport takes a light.
+            If no transport takes a light, or a batch is no list or an empty one.
         SettingsError
             If the component is another, or not there for distant light (see `keep_direct`).
 
@@ -248,6 +263,8 @@ class Asset:
             If a local light stands in the convex hull of the scene and only transport of distant
             light is there to answer for it: that holds visibility to infinity.
         """
+        if batch:
+            return batch_irradiance(self, light, component, nearest)
         shares = self.shared_out(self.resolved(light))
         for warning in self.warnings(shares):
             warnings.warn(warning, LightWarning, stacklevel=2)
@@ -267,11 +284,11 @@ class Asset:
             total += self.transports[kind].respond(self.points, question)
         return total
 
-    def relight(self, light=None, component="total", nearest=None):
-        """Outgoing radiance B = ρ/π · E at the points, (n, 3) float32 in W/(m²·sr); see
-        `irradiance`.
+    def relight(self, light=None, component="total", nearest=None, *, batch=False):
+        """Outgoing radiance B = ρ/π · E at the points, (n, 3) float32 in W/(m²·sr), or (m, n, 3) of
+        a batch; see `irradiance`.
         """
-        return self.outgoing_radiance(self.irradiance(light, component, nearest))
+        return self.outgoing_radiance(self.irradiance(light, component, nearest, batch=batch))
 
     def outgoing_radiance(self, irradiance):
         """Outgoing radiance B = ρ/π · E (n, 3) of irradiance (n, 3) at the points."""

@@ -93,6 +93,13 @@ class Basis(ABC):
         with one_blas_thread():
             return self.project_light(cell_radiance(light, directions))
 
+    def project_all(self, lights, directions):
+        """Light (m, d, 3) and the mean's response (m, 3) of m `Light`s without local lights."""
+        projected = [self.project(light, directions) for light in lights]
+        return np.stack([light for light, _ in projected]), np.stack(
+            [mean for _, mean in projected]
+        )
+
     def prepare(self, light, directions):
         """A `Light` in a form that turns, and is projected, in milliseconds."""
         return on_lattice(light, directions)

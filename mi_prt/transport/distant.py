@@ -69,29 +69,38 @@ class DistantTransport(Transport):
 
     def respond(self, points, question):
         """See `Transport.respond`."""
-        if question.component == "total":
-            return self._irradiance(self.total, points, question)
+        return self.respond_all(points, [question])[0]
+
+    def respond_all(self, points, questions):
+        """See `Transport.respond_all`; all of one component."""
+        component = questions[0].component
+        if component == "total":
+            return self._irradiance(self.total, points, questions)
         if not self.reflects:
-            if question.component == "direct":
-                return self._irradiance(self.total, points, question)
-            return np.zeros((len(points), 3), np.float32)
+            if component == "direct":
+                return self._irradiance(self.total, points, questions)
+            return np.zeros((len(questions), len(points), 3), np.float32)
         if self.direct is None:
             raise SettingsError(
-                f"component '{question.component}': this asset holds direct and reflected distant"
+                f"component '{component}': this asset holds direct and reflected distant"
                 " light in one; precompute it with keep_direct (--keep-direct) to tell them apart"
             )
-        total = self._irradiance(self.total, points, question)
-        direct = np.minimum(self._irradiance(self.direct, points, question), total)
-        return direct if question.component == "direct" else total - direct
+        total = self._irradiance(self.total, points, questions)
+        direct = np.minimum(self._irradiance(self.direct, points, questions), total)
+        return direct if component == "direct" else total - direct
 
-    def _irradiance(self, transport, points, question):
-        """Irradiance (n, 3); what compression leaves below zero of the sum is zero."""
-        light = question.light
-        irradiance = transport.respond(*transport.basis.project(light.distant, self.directions))
-        for cells, shares, strength in arrival(
-            emission_of(light.local), points.positions, self.directions, question.nearest
-        ):
-            irradiance += strength * transport.in_cells(cells, shares)
+    def _irradiance(self, transport, points, questions):
+        """Irradiance (m, n, 3); what compression leaves below zero of the sums is zero."""
+        lights = [question.light.distant for question in questions]
+        irradiance = transport.respond_all(*transport.basis.project_all(lights, self.directions))
+        for of_light, question in zip(irradiance, questions):
+            for cells, shares, strength in arrival(
+                emission_of(question.light.local),
+                points.positions,
+                self.directions,
+                question.nearest,
+            ):
+                of_light += strength * transport.in_cells(cells, shares)
         return np.maximum(irradiance, 0, out=irradiance)
 
     def prepare(self, light):

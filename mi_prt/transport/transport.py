@@ -112,7 +112,7 @@ class Transport(ABC):
         return None
 
     @abstractmethod
-    def respond(self, points, question):
+    def respond(self, points, question) -> np.ndarray:
         """Irradiance at the points.
 
         Parameters
@@ -131,6 +131,10 @@ class Transport(ABC):
         SettingsError
             If it does not hold the component.
         """
+
+    def respond_all(self, points, questions):
+        """Irradiance (m, n, 3) float32, the answers to m questions; see `respond`."""
+        return np.stack([self.respond(points, question) for question in questions])
 
     def prepare(self, light):
         """Light in a form that turns, and is projected, in milliseconds; a Light."""
