@@ -6,6 +6,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from ..errors import SettingsError
 from ..lighting.cells import cell_radiance
 from ..lighting.lattice import on_lattice
 from ..system.parallel import one_blas_thread
@@ -103,6 +104,19 @@ class Basis(ABC):
     def prepare(self, light, directions):
         """A `Light` in a form that turns, and is projected, in milliseconds."""
         return on_lattice(light, directions)
+
+    def truncated(self, components):
+        """The basis of the first so many components, 1…d, by which coefficients stay what they are.
+
+        Raises
+        ------
+        SettingsError
+            If its components are not nested, or not in that number.
+        """
+        raise SettingsError(
+            f"the basis {self.kind} has no first {components:,} components that all points share:"
+            f" precompute the scene again with coefficients {components} (--coefficients)"
+        )
 
     # --- before there is one ------------------------------------------------------------------
 

@@ -66,7 +66,7 @@ class Compressed:
         if self._channels_apart:
             joined = np.ascontiguousarray(lights.transpose(2, 1, 0))  # (3, d, m)
         else:
-            joined = lights.transpose(1, 0, 2).reshape(lights.shape[1], -1)  # (d, m·3)
+            joined = lights.transpose(1, 0, 2).reshape(lights.shape[1], 3 * len(lights))
 
         def fill(first):
             block = slice(first, first + BATCH_ROWS)

@@ -212,6 +212,11 @@ class HarmonicBasis(LinearBasis):
         coefficients, mean = super().project(others, directions)
         return sum((m.turned() for m in known), coefficients), mean
 
+    def truncated(self, components):
+        """See `Basis.truncated`: whole bands."""
+        _bands_of(components)
+        return super().truncated(components)
+
     project_all = Basis.project_all  # by `project`, which knows maps that turn in closed form
 
     def prepare(self, light, directions):

@@ -1,12 +1,13 @@
 """Transport of distant light: a basis, and the coefficients of all points (Eigentransport)."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from ..basis.basis import BASES
 from ..basis.compressed import Compressed
+from ..basis.truncated import truncated
 from ..directions import parse_directions
 from ..errors import SettingsError
 from ..lighting.emission import emission_of
@@ -102,6 +103,16 @@ class DistantTransport(Transport):
             ):
                 of_light += strength * transport.in_cells(cells, shares)
         return np.maximum(irradiance, 0, out=irradiance)
+
+    def truncated(self, components, points):
+        """See `Transport.truncated`; the report says what is still captured."""
+        kept = ~points.buried if not points.buried.all() else points.buried
+        total, quality = truncated(self.total, components, kept, self.report)
+        direct = self.direct
+        if direct is not None and len(direct.basis) > components:
+            direct = truncated(direct, components, kept, self.report)[0]
+        report = self.report | quality | {"truncated_from": len(self.basis)}
+        return replace(self, total=total, direct=direct, report=report)
 
     def prepare(self, light):
         """Maps on a fine lattice; spherical harmonics turn them in closed form."""

@@ -136,6 +136,16 @@ class Transport(ABC):
         """Irradiance (m, n, 3) float32, the answers to m questions; see `respond`."""
         return np.stack([self.respond(points, question) for question in questions])
 
+    def truncated(self, components, points):
+        """The transport with fewer components, where it has a number of them that can be chosen.
+
+        Raises
+        ------
+        SettingsError
+            If it cannot be had in that number.
+        """
+        return self
+
     def prepare(self, light):
         """Light in a form that turns, and is projected, in milliseconds; a Light."""
         return light
