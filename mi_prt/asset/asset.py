@@ -12,11 +12,14 @@ from ..lighting.environment import LightWarning
 from ..lighting.light import Light
 from ..lighting.own_light import SceneLight, resolve
 from ..points.points import Points
+from ..system.registry import Registry
 from ..transport.ledger import Entry
 from ..transport.transport import COMPONENTS, TRANSPORTS, Question
 from . import file
 from .batch import batch_irradiance
 from .provenance import open_scene_of, scene_is_open
+
+DRAWINGS = Registry("drawing", "mi_prt.render")  # what draws an asset; it lies above this layer
 
 
 @dataclass(frozen=True, eq=False)
@@ -297,6 +300,67 @@ class Asset:
     @cached_property
     def _reflection(self):
         return self.points.albedo * np.float32(1 / np.pi)
+
+    def render(
+        self,
+        light=None,
+        *,
+        sensor=0,
+        camera=None,
+        size=None,
+        spp=64,
+        scene=None,
+        rotate=None,
+        component="total",
+        direct="points",
+        renderer="mitsuba",
+    ):
+        """The scene as a camera sees it under some light.
+
+        >>> asset.render("sky.exr", camera=mi_prt.Camera((0, 2, 6), (0, 0, 0)), size=(640, 480))
+
+        Parameters
+        ----------
+        light : what `as_light` accepts, 'scene', or a list of these, optional
+            By default the scene's own light.
+        sensor : int
+            Index of the scene's sensor.
+        camera : Camera, optional
+            In its place.
+        size : (width, height), optional
+            Of the image; by default the sensor's, or 640 × 480 of a camera.
+        spp : int
+            Samples per pixel of the integrator.
+        scene : path, dict or mi.Scene, optional
+            The asset's scene, where it was given in memory or is somewhere else by now.
+        rotate : (axis, degrees), optional
+            Turns the distant light.
+        component, direct, renderer :
+            As of `relight_to_file`.
+
+        Returns
+        -------
+        (h, w, 3) float32
+            Linear radiance, W/(m²·sr).
+
+        Raises
+        ------
+        LightError, SceneError, SettingsError
+            As of `relight_to_file`.
+        """
+        return DRAWINGS["image"](
+            self,
+            light,
+            sensor=sensor,
+            camera=camera,
+            size=size,
+            spp=spp,
+            scene=scene,
+            rotate=rotate,
+            component=component,
+            direct=direct,
+            renderer=renderer,
+        )
 
     def truncated(self, components):
         """The asset with the first so many components of distant transport: a smaller file, faster

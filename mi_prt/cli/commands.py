@@ -76,16 +76,9 @@ def info(
     as_json: Json = False,
 ):
     """Say what a scene requires and what precomputing it will cost, or what an asset holds."""
-    from ..asset.asset import load
-    from ..asset.container import is_asset
-    from ..asset.describe import describe_asset
-    from ..precompute.forecast import describe
+    from ..precompute.info import info as run
 
-    if is_asset(path):
-        found = describe_asset(load(path))
-    else:
-        found = describe(path, take.parameters_of(define), **settings)
-    _show(found, as_json)
+    _show(run(path, take.parameters_of(define), **settings), as_json)
 
 
 @app.command(

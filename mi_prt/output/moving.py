@@ -9,7 +9,7 @@ from ..errors import LightError
 from ..lighting.light import Light
 from ..render.display import display
 from ..render.picture import RENDERERS, Picture
-from .film import FPS, FRAMES, check_frames_output, write_frames
+from .film import FPS, FRAMES, as_path, check_frames_output, write_frames
 
 FRAME_SAMPLES = 1  # of a frame's pixel, along each side, of splats
 
@@ -38,7 +38,8 @@ def animate(
     asset : Asset
     output : path
         .mp4 or .gif, or .png with the number of the frame in its name, such as frame-%03d.png.
-    path : LightPath
+    path : LightPath, (k, 3), or text
+        Positions that the light goes through, such as '0,1,0 1,1,0 1,1,1'.
     frames, fps : int
     light : what `as_light` accepts, or a list of such
         Whose first point, spot or area light moves; all else stays.
@@ -55,7 +56,7 @@ def animate(
     check_frames_output(output, fps)
     opened = open_scene_of(asset, scene)
     moving = _Moving(asset.resolved(light, rotate, opened))
-    places = path.positions(frames)
+    places = as_path(path).positions(frames)
     first = moving.at(places[0])
     film = _Film(Picture(asset, opened, first, component, direct), moving, progress, frames)
     # A light that is a shape is seen: what is drawn changes with its place.
