@@ -38,8 +38,8 @@ from .output.relight import relight_to_file
 from .precompute.info import info
 from .precompute.precompute import precompute
 from .precompute.settings import Settings
-from .render.camera import Camera
 from .render.integrator import register_integrator
+from .scene.camera import Camera
 from .scene.scene import open_scene
 
 __version__ = "0.5.0"

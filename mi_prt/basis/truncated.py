@@ -82,7 +82,7 @@ def _energies(compressed, components, kept):
         return len(rows), rows.sum(axis=0), rows.T @ rows
 
     counts, totals, products = zip(*map_chunks(sums, range(0, len(compressed), _CHUNK)))
-    count, total, product = sum(counts), sum(totals), sum(products)
+    count, total, product = sum(counts), np.sum(totals, axis=0), np.sum(products, axis=0)
     around = float(np.sum(product * gram))  # of the rows without the mean
     held = around + 2 * float(total @ cross) + count * float(mean @ mean)
     centred = around - float(total @ gram @ total) / max(count, 1)

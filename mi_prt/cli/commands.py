@@ -16,6 +16,7 @@ from .options import (
     Define,
     Direct,
     Environment,
+    Floor,
     Frames,
     FramesPerSecond,
     Json,
@@ -70,21 +71,24 @@ def doctor(as_json: Json = False):
 @with_settings
 @flowing
 def info(
-    path: Annotated[Path, typer.Argument(help="A scene (XML) or an asset.")],
+    path: Annotated[Path, typer.Argument(help="A scene (XML), a mesh or an asset.")],
     settings: dict,
     define: Define = None,
+    floor: Floor = False,
     as_json: Json = False,
 ):
     """Say what a scene requires and what precomputing it will cost, or what an asset holds."""
     from ..precompute.info import info as run
 
-    _show(run(path, take.parameters_of(define), **settings), as_json)
+    _show(run(path, take.parameters_of(define, floor), **settings), as_json)
 
 
 @app.command(
     epilog=(
         "Examples: mi-prt precompute scenes/teapot.xml -o teapot.prt --coefficients 96 -D"
         " spp=16\n\nmi-prt precompute scenes/day_room.xml -o room.prt   (its sky and its lamps)\n\n"
+        "mi-prt precompute scenes/meshes/teapot.ply -o teapot.prt --floor   (.ply, .obj, .glb,"
+        " .stl)\n\n"
         "mi-prt precompute scenes/teapot.xml -o teapot.prt --coefficients auto --variance 0.98"
         " --max-memory 2G --resume\n\nmi-prt precompute scenes/room.xml -o room.prt --transports"
         " own,local --points samples --count 45000"
@@ -93,7 +97,7 @@ def info(
 @with_settings
 @flowing
 def precompute(
-    scene: Annotated[Path, typer.Argument(help="A Mitsuba XML file.")],
+    scene: Annotated[Path, typer.Argument(help="A Mitsuba XML file or a mesh.")],
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="FILE", help="The asset to write.")
     ],
@@ -110,6 +114,7 @@ def precompute(
     ] = None,
     threads: Threads = None,
     define: Define = None,
+    floor: Floor = False,
     as_json: Json = False,
 ):
     """Precompute a scene's transport into one file.
@@ -128,7 +133,7 @@ def precompute(
     with progress_bar(kept=f"{output}.partial") as progress:
         asset, cost = measure(
             scene,
-            take.parameters_of(define),
+            take.parameters_of(define, floor),
             progress,
             output,
             resume,

@@ -37,8 +37,13 @@ Threads = Annotated[
 ]
 Define = Annotated[
     list[str] | None,
-    typer.Option("-D", metavar="NAME=VALUE", help="Value for a <default> parameter of the XML."),
+    typer.Option(
+        "-D",
+        metavar="NAME=VALUE",
+        help="Value for a <default> parameter of the XML; of a mesh normals=flat, up=z, grey=0.5.",
+    ),
 ]
+Floor = Annotated[bool, typer.Option("--floor", help="Put a grey floor under a mesh.")]
 Environment = Annotated[
     Path | None,
     typer.Option(
@@ -157,9 +162,9 @@ def _shown(value):
 # --- what the user passes ------------------------------------------------------------------------
 
 
-def parameters_of(define):
-    """Values for `<default>` parameters from NAME=VALUE texts."""
-    parameters = {}
+def parameters_of(define, floor=False):
+    """Values for `<default>` parameters, or of a mesh, from NAME=VALUE texts and --floor."""
+    parameters = {"floor": "on"} if floor else {}
     for entry in define or []:
         name, equals, value = entry.partition("=")
         if not (name and equals):

@@ -36,6 +36,7 @@ def scene_light(scene):
     if not distant:
         raise LightError(
             "the scene has no distant light (envmap, constant, sunsky, directional): pass a light"
+            " (--envmap sky.exr, or --light)"
         )
     return Light(tuple(map(distant_part, distant)))
 

@@ -217,7 +217,9 @@ class _OwnLights:
         else:
             known = [(key, is_distant, None) for key, is_distant in self._names.items()]
         if not known:
-            raise LightError("the scene has no light of its own: pass a light, --light")
+            raise LightError(
+                "the scene has no light of its own: pass a light (--envmap sky.exr, or --light)"
+            )
         found = [entry for entry in known if name in (None, entry[0])]
         if not found:
             raise LightError(

@@ -5,8 +5,8 @@ from contextlib import contextmanager
 import numpy as np
 
 from ..errors import SettingsError
+from ..scene.camera import Camera
 from ..system.runtime import mitsuba
-from .camera import Camera
 from .integrator import integrator_for
 
 MAX_PIXELS = 1 << 26

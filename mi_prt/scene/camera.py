@@ -70,14 +70,14 @@ class Camera:
         if not 1 <= len(rest) <= 3:
             raise SettingsError(f"camera '{text}' is not understood: {_HELP}")
         try:
-            places = [tuple(map(float, part.split(","))) for part in (origin, rest[0])]
+            start, end = (tuple(map(float, part.split(","))) for part in (origin, rest[0]))
             fov = float(rest[1]) if len(rest) > 1 else FOV
             up = rest[2] if len(rest) > 2 else None
             if up is not None and up not in _AXES:
                 up = tuple(map(float, up.split(",")))
         except ValueError:
             raise SettingsError(f"camera '{text}' is not understood: {_HELP}") from None
-        return cls(*places, fov, up)
+        return cls(start, end, fov, up)
 
     @classmethod
     def looking_at(cls, low, high, up="y"):
