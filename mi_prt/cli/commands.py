@@ -16,6 +16,7 @@ from .options import (
     Define,
     Direct,
     Environment,
+    Environments,
     Floor,
     Frames,
     FramesPerSecond,
@@ -25,9 +26,10 @@ from .options import (
     OtherScene,
     Rotate,
     Seed,
-    Sensor,
+    Sensors,
     Size,
     Threads,
+    Viewpoint,
     flowing,
     with_settings,
 )
@@ -46,6 +48,26 @@ app = typer.Typer(
         " teapot.prt && mi-prt relight teapot.prt -o teapot.png --rotate y:45"
     ),
 )
+
+
+def _print_version(wanted: bool):
+    if wanted:
+        from .. import __version__
+
+        print(f"mi-prt {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", callback=_print_version, is_eager=True, help="Print the version."
+        ),
+    ] = False,
+):
+    """Options of the program itself."""
 
 
 @app.command(epilog="Example: mi-prt doctor --json")
@@ -161,7 +183,9 @@ def precompute(
         "Examples: mi-prt relight teapot.prt -o teapot.png --envmap sky.exr --rotate y:90 --size"
         " 640x480\n\nmi-prt relight room.prt -o dusk.png --light 'scene:sky_1*0.05' --light"
         " scene:floor_lamp\n\nmi-prt relight room.prt -o lamp.png --light point:0,1.5,0:8,7,6"
-        " --component indirect\n\nmi-prt relight room.prt -o walk.mp4 --light point:0,1.5,0:8,7,6"
+        " --component indirect\n\nmi-prt relight teapot.prt -o 'out/{map}_{sensor}.png' --envmap"
+        " skies --sensor all\n\nmi-prt relight teapot.prt -o near.png --camera 0,2,6:0,0.5,0:45"
+        "\n\nmi-prt relight room.prt -o walk.mp4 --light point:0,1.5,0:8,7,6"
         " --light-path '-1,1.5,0 1,1.5,0 1,1.5,1' --renderer raster"
     )
 )
@@ -174,14 +198,16 @@ def relight(
             "-o",
             "--output",
             metavar="OUT",
-            help=".exr, .png, .ply or .npz; of a film .mp4, .gif or frame-%03d.png",
+            help=".exr, .png, .ply or .npz; of a film .mp4, .gif or frame-%03d.png; of several maps"
+            " or sensors with {map} and {sensor} in its name",
         ),
     ],
-    envmap: Environment = None,
+    envmap: Environments = None,
     light: Lights = None,
     nearest: Nearest = None,
     rotate: Rotate = None,
-    sensor: Sensor = 0,
+    sensor: Sensors = None,
+    camera: Viewpoint = None,
     size: Size = None,
     renderer: Annotated[
         str, typer.Option("--renderer", metavar="mitsuba|raster", help="How pictures are drawn.")
@@ -208,15 +234,15 @@ def relight(
     """
     from ..asset.asset import load
     from ..output.film import light_path as path_of
+    from ..output.many import ALL, map_files, relight_many
     from ..output.moving import animate
-    from ..output.relight import relight_to_file
 
     take.set_threads(threads)
-    chosen, turned = take.light_of(envmap, light), take.rotation_of(rotate)
+    maps, sensors = map_files(envmap or []), take.sensors_of(sensor, camera)
+    turned = take.rotation_of(rotate)
     asset = load(asset_path)
     shown = {
         "scene": scene,
-        "sensor": sensor,
         "size": take.size_of(size),
         "renderer": renderer,
         "spp": spp,
@@ -226,13 +252,33 @@ def relight(
     }
     film = {k: v for k, v in (("frames", frames), ("fps", fps)) if v is not None}
     if light_path is not None:
+        if len(maps) > 1 or sensors == ALL:
+            raise SettingsError(
+                "--light-path makes one film: give one --envmap at most, and one --sensor"
+            )
         path = path_of(light_path)
+        chosen = take.light_of(maps[0] if maps else None, light)
         with progress_bar() as progress:
-            result = animate(asset, output, path, light=chosen, progress=progress, **film, **shown)
+            result = animate(
+                asset,
+                output,
+                path,
+                light=chosen,
+                sensor=sensors[0],
+                progress=progress,
+                **film,
+                **shown,
+            )
     elif film:
         raise SettingsError("--frames and --fps are of a film: give --light-path as well")
     else:
-        result = relight_to_file(asset, output, chosen, nearest=nearest, **shown)
+        lights = take.light_of(None, light)
+        files = relight_many(asset, output, maps, sensors, lights, nearest=nearest, **shown)
+        if len(files) > 1:
+            _show({"files": files}, as_json)
+            return
+        output = files[0].pop("file")
+        result = {k: v for k, v in files[0].items() if k not in ("map", "sensor")}
     _show(result if as_json else {"wrote": str(output)} | result, as_json)
 
 
@@ -253,7 +299,8 @@ def compare(
     light: Lights = None,
     nearest: Nearest = None,
     rotate: Rotate = None,
-    sensor: Sensor = 0,
+    sensor: Sensors = None,
+    camera: Viewpoint = None,
     size: Size = None,
     spp: Annotated[int, typer.Option("--spp", help="Samples per pixel of the reference.")] = 256,
     reference: Annotated[
@@ -275,6 +322,9 @@ def compare(
     from ..evaluate.compare import compare as run
 
     take.set_threads(threads)
+    sensors = take.sensors_of(sensor, camera)
+    if sensors == "all":
+        raise SettingsError("--sensor all is of relight: a report has one picture, give an index")
     asset = load(asset_path)
     with progress_bar() as progress:
         result = run(
@@ -283,7 +333,7 @@ def compare(
             take.light_of(envmap, light),
             rotate=take.rotation_of(rotate),
             scene=scene,
-            sensor=sensor,
+            sensor=sensors[0],
             size=take.size_of(size),
             spp=spp,
             reference=reference,
@@ -322,7 +372,7 @@ def main(arguments=None):
 
 
 def _only_help(arguments):
-    return not arguments or any(a in ("-h", "--help") for a in arguments)
+    return not arguments or any(a in ("-h", "--help", "--version") for a in arguments)
 
 
 def _show(found, as_json):

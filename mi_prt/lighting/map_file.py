@@ -7,6 +7,9 @@ import numpy as np
 from ..errors import LightError
 from ..system.runtime import mitsuba
 
+# what OpenEXR and Mitsuba read
+ENDINGS = (".exr", ".hdr", ".rgbe", ".pfm", ".ppm", ".png", ".jpg", ".jpeg", ".tga", ".bmp")
+
 
 def read_pixels(source):
     """Pixels of a path, a mi.Bitmap or whatever NumPy takes, not checked; see `EnvironmentMap`."""
