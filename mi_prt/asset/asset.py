@@ -17,12 +17,13 @@ from ..transport.ledger import Entry
 from ..transport.transport import COMPONENTS, TRANSPORTS, Question
 from . import file
 from .batch import batch_irradiance
+from .describe import summary_line, summary_table
 from .provenance import open_scene_of, scene_is_open
 
 DRAWINGS = Registry("drawing", "mi_prt.render")  # what draws an asset; it lies above this layer
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Asset:
     """A scene's precomputed transport: everything that relighting needs.
 
@@ -52,6 +53,13 @@ class Asset:
     versions: dict
     report: dict
     path: Path | None = field(default=None, compare=False)
+
+    def __repr__(self):
+        return summary_line(self)
+
+    def _repr_html_(self):
+        """A table for notebooks."""
+        return summary_table(self)
 
     # --- light --------------------------------------------------------------------------------
 

@@ -64,6 +64,15 @@ class DistantTransport(Transport):
         return self.report["bounces"] != 0
 
     @property
+    def words(self):
+        """See `Transport.words`."""
+        captured = self.report["captured_variance"]
+        return (
+            f"{len(self.basis):,} coefficients ({self.basis.kind}) on {self.directions},"
+            f" {100 * captured:.1f} % of the variance"
+        )
+
+    @property
     def components(self):
         """All, or the total alone where direct light was not kept apart."""
         return COMPONENTS if self.direct is not None or not self.reflects else ("total",)

@@ -151,6 +151,11 @@ class Transport(ABC):
         return light
 
     @property
+    def words(self):
+        """What it holds, in a few words."""
+        return self.takes_words
+
+    @property
     def channels(self):
         """Colour channels of the transport: 3 where reflections colour the light, else 1."""
         return self.report.get("channels", 1)
