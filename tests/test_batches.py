@@ -133,3 +133,17 @@ def test_the_example_and_the_benchmark_run(tmp_path, monkeypatch, capsys):
     assert "3 maps on" in said and "| batches |" in said
     radiance = np.load(tmp_path / "00_lampshade.npy")
     assert radiance.dtype == np.float16 and len(radiance) == 3 and radiance.max() > 0
+
+
+@pytest.mark.parametrize(("shape", "spacing"), [((9, 16), 0.1), ((64, 128), 0.1)])
+def test_moments_of_groups_are_sums_of_those_of_samples(shape, spacing):
+    """A coarse map, which is split, and a fine one, which is summed; turned, in random groups."""
+    rng = np.random.default_rng(0)
+    sky = mi_prt.EnvironmentMap(rng.exponential(size=(*shape, 3))).rotated((1, 2, 3), 40)
+    samples = sky.quadrature(spacing)
+    group = rng.integers(5, size=len(samples.energy))
+    order, ends = np.argsort(group, kind="stable"), np.append(0, np.cumsum(np.bincount(group)))
+    found = samples.moments_in(order, ends)
+    for number in range(5):
+        expected = samples.moments[group == number].sum(axis=0, dtype=float)
+        np.testing.assert_allclose(found[number], expected, atol=1e-4 * np.abs(expected).max())

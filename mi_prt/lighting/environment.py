@@ -50,7 +50,7 @@ class EnvironmentMap(DistantPart):
     Attributes
     ----------
     pixels : (h, w, 3) float32
-        Read-only: means over cells of a lattice are computed once for each map.
+        Read-only, as means over cells are computed once for each map; `mi.Bitmap` takes a copy.
     negative_pixels : int
         Pixels in which a negative value was set to zero.
 
