@@ -3,8 +3,8 @@ caches cold.
 
 Usage: python benchmarks/batch.py [--meshes 10] [--maps 200] [--size 512x256] [--single 20]
 
-One by one, each call is given a new map, so that nothing is shared between calls, as it was up to
-0.5.0; so many maps as --single says are timed and the time is scaled. Prints a Markdown table and
+One by one, each call is given a new map, so that nothing is shared between calls; so many maps as
+--single says are timed and the time is scaled. Prints a Markdown table and
 checks that both give the same. Nothing else should run on the machine meanwhile.
 """
 
