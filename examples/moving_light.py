@@ -8,12 +8,10 @@ import time
 from pathlib import Path
 
 import mi_prt
-from mi_prt.output.film import light_path
-from mi_prt.output.moving import animate
 
 SCENE = Path(__file__).resolve().parent.parent / "scenes" / "room.xml"
 # through the doorway
-WALK = light_path("1.6,1.7,1.6 -0.6,1.7,1.5 0.1,1.6,0.2 0.1,1.6,-1.4 -1.6,1.7,-1.8 1.4,1.7,-2.0")
+WALK = "1.6,1.7,1.6 -0.6,1.7,1.5 0.1,1.6,0.2 0.1,1.6,-1.4 -1.6,1.7,-1.8 1.4,1.7,-2.0"
 INTENSITY = (3.2, 2.9, 2.5)  # W/sr
 SIZE = (480, 300)
 
@@ -44,9 +42,11 @@ def main():
         f" {time.perf_counter() - started:.0f} s"
     )
 
-    lamp = mi_prt.PointLight(WALK.positions(1)[0], INTENSITY)
+    lamp = mi_prt.PointLight((1.6, 1.7, 1.6), INTENSITY)
     film = arguments.out / "walk.mp4"
-    told = animate(asset, film, WALK, arguments.frames, light=lamp, size=SIZE, renderer="raster")
+    told = mi_prt.animate(
+        asset, film, WALK, arguments.frames, light=lamp, size=SIZE, renderer="raster"
+    )
     seconds = told["seconds"]
     print(
         f"{film}: relight {1e3 * seconds['relight'] / arguments.frames:.1f} ms, draw"

@@ -36,30 +36,42 @@ from .lighting.light import Light
 from .lighting.own_light import SceneLight
 from .lighting.point import PointLight
 from .lighting.spot import SpotLight
+from .output.film import LightPath
+from .output.moving import animate
 from .output.relight import relight_to_file
+from .precompute.info import info
 from .precompute.precompute import precompute
+from .precompute.settings import Settings
 from .render.integrator import register_integrator
+from .scene.camera import Camera
+from .scene.scene import open_scene
 
 __version__ = "0.5.0"
 __all__ = [
     "AreaLight",
     "Asset",
     "AssetError",
+    "Camera",
     "DirectionalLight",
     "EnvironmentMap",
     "InputError",
     "Light",
     "LightError",
+    "LightPath",
     "LightWarning",
     "PointLight",
     "PrtError",
     "RuntimeSetupError",
     "SceneError",
     "SceneLight",
+    "Settings",
     "SettingsError",
     "SpotLight",
+    "animate",
     "compare",
+    "info",
     "load",
+    "open_scene",
     "precompute",
     "relight_to_file",
 ]

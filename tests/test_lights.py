@@ -381,7 +381,7 @@ def test_turning_on_the_lattice_is_turning_the_map_and_mitsubas_emitter(directio
         fast, exact = (asset.irradiance(light.rotated(axis, degrees)) for light in (prepared, sky))
         assert relative_l2(fast, exact) < 0.01 and abs(bias(fast, exact)) < 1e-3
         turned = mi.ScalarTransform4f().rotate(axis, degrees)
-        emitter = {"type": "envmap", "bitmap": mi.Bitmap(sky.pixels), "to_world": turned}
+        emitter = {"type": "envmap", "bitmap": mi.Bitmap(sky.pixels.copy()), "to_world": turned}
         truth = ground_truth.point_irradiance(
             mi.load_dict(box_on_floor(sky=emitter)), asset.points, 1 << 14
         )
@@ -657,7 +657,7 @@ def test_maps_of_other_grids_are_resampled():
         emitters = (
             {
                 "type": "envmap",
-                "bitmap": mi.Bitmap(m.pixels),
+                "bitmap": mi.Bitmap(m.pixels.copy()),
                 "to_world": matrix_transform(m.rotation),
             }
             for m in maps

@@ -1,8 +1,8 @@
 """The asset: points, and transports of light to them."""
 
 import warnings
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass, field, replace
+from functools import cache, cached_property
 from pathlib import Path
 
 import numpy as np
@@ -12,13 +12,18 @@ from ..lighting.environment import LightWarning
 from ..lighting.light import Light
 from ..lighting.own_light import SceneLight, resolve
 from ..points.points import Points
+from ..system.registry import Registry
 from ..transport.ledger import Entry
 from ..transport.transport import COMPONENTS, TRANSPORTS, Question
 from . import file
+from .batch import batch_irradiance
+from .describe import summary_line, summary_table
 from .provenance import open_scene_of, scene_is_open
 
+DRAWINGS = Registry("drawing", "mi_prt.render")  # what draws an asset; it lies above this layer
 
-@dataclass(frozen=True, eq=False)
+
+@dataclass(frozen=True, eq=False, repr=False)
 class Asset:
     """A scene's precomputed transport: everything that relighting needs.
 
@@ -48,6 +53,13 @@ class Asset:
     versions: dict
     report: dict
     path: Path | None = field(default=None, compare=False)
+
+    def __repr__(self):
+        return summary_line(self)
+
+    def _repr_html_(self):
+        """A table for notebooks."""
+        return summary_table(self)
 
     # --- light --------------------------------------------------------------------------------
 
@@ -84,15 +96,19 @@ class Asset:
         SettingsError
             If there is no distant light to turn.
         """
+        return self._resolved(light, rotate, scene, cache(lambda: open_scene_of(self, scene)))
+
+    def _resolved(self, light, rotate, scene, opened):
+        """See `resolved`; `opened` gives the Scene."""
         if light is None:
             light = self._own_light()
         names = {emitter["name"]: emitter["distant"] for emitter in self.emitters}
         if scene_is_open(scene):
             light = resolve(light, scene)
         else:
-            light = resolve(light, lambda: open_scene_of(self, scene), names)
+            light = resolve(light, opened, names)
             if any(map(self._needs_scene, light.parts)):
-                light = resolve(light, open_scene_of(self, scene))
+                light = resolve(light, opened())
         if rotate is None:
             return light
         if light.distant.is_empty:
@@ -101,6 +117,11 @@ class Asset:
                 " (--rotate)"
             )
         return light.rotated(*rotate)
+
+    def resolved_all(self, lights):
+        """Each of several lights resolved, a list of `Light`; the scene is opened once at most."""
+        opened = cache(lambda: open_scene_of(self))
+        return [self._resolved(light, None, None, opened) for light in lights]
 
     def _own_light(self):
         """The scene's own light, as far as the asset holds it."""
@@ -222,8 +243,11 @@ class Asset:
 
     # --- relighting ---------------------------------------------------------------------------
 
-    def irradiance(self, light=None, component="total", nearest=None):
+    def irradiance(self, light=None, component="total", nearest=None, *, batch=False):
         """Irradiance at the points.
+
+        >>> asset.irradiance([sky, sun])  # their sum, (n, 3)
+        >>> asset.irradiance(maps, batch=True)  # each alone, (m, n, 3): one matrix product
 
         Parameters
         ----------
@@ -235,16 +259,18 @@ class Asset:
             Directions that stand for a local light where transport is for distant light only
             (Eigentransport, section 4.2.1); by default the three around its own, in shares that
             keep its direction.
+        batch : bool
+            Whether `light` is a list of m lights (or of lists, their sums), each asked for alone.
 
         Returns
         -------
-        (n, 3) float32
+        (n, 3) float32, or (m, n, 3) of a batch
             W/m².
 
         Raises
         ------
         LightError
-            If no transport takes a light.
+            If no transport takes a light, or a batch is no list or an empty one.
         SettingsError
             If the component is another, or not there for distant light (see `keep_direct`).
 
@@ -254,6 +280,8 @@ class Asset:
             If a local light stands in the convex hull of the scene and only transport of distant
             light is there to answer for it: that holds visibility to infinity.
         """
+        if batch:
+            return batch_irradiance(self, light, component, nearest)
         shares = self.shared_out(self.resolved(light))
         for warning in self.warnings(shares):
             warnings.warn(warning, LightWarning, stacklevel=2)
@@ -273,11 +301,11 @@ class Asset:
             total += self.transports[kind].respond(self.points, question)
         return total
 
-    def relight(self, light=None, component="total", nearest=None):
-        """Outgoing radiance B = ρ/π · E at the points, (n, 3) float32 in W/(m²·sr); see
-        `irradiance`.
+    def relight(self, light=None, component="total", nearest=None, *, batch=False):
+        """Outgoing radiance B = ρ/π · E at the points, (n, 3) float32 in W/(m²·sr), or (m, n, 3) of
+        a batch; see `irradiance`.
         """
-        return self.outgoing_radiance(self.irradiance(light, component, nearest))
+        return self.outgoing_radiance(self.irradiance(light, component, nearest, batch=batch))
 
     def outgoing_radiance(self, irradiance):
         """Outgoing radiance B = ρ/π · E (n, 3) of irradiance (n, 3) at the points."""
@@ -286,6 +314,100 @@ class Asset:
     @cached_property
     def _reflection(self):
         return self.points.albedo * np.float32(1 / np.pi)
+
+    def render(
+        self,
+        light=None,
+        *,
+        sensor=0,
+        camera=None,
+        size=None,
+        spp=64,
+        scene=None,
+        rotate=None,
+        component="total",
+        direct="points",
+        renderer="mitsuba",
+    ):
+        """The scene as a camera sees it under some light.
+
+        >>> asset.render("sky.exr", camera=mi_prt.Camera((0, 2, 6), (0, 0, 0)), size=(640, 480))
+
+        Parameters
+        ----------
+        light : what `as_light` accepts, 'scene', or a list of these, optional
+            By default the scene's own light.
+        sensor : int
+            Index of the scene's sensor.
+        camera : Camera, optional
+            In its place.
+        size : (width, height), optional
+            Of the image; by default the sensor's, or 640 × 480 of a camera.
+        spp : int
+            Samples per pixel of the integrator.
+        scene : path, dict or mi.Scene, optional
+            The asset's scene, where it was given in memory or is somewhere else by now.
+        rotate : (axis, degrees), optional
+            Turns the distant light.
+        component, direct, renderer :
+            As of `relight_to_file`.
+
+        Returns
+        -------
+        (h, w, 3) float32
+            Linear radiance, W/(m²·sr).
+
+        Raises
+        ------
+        LightError, SceneError, SettingsError
+            As of `relight_to_file`.
+        """
+        return DRAWINGS["image"](
+            self,
+            light,
+            sensor=sensor,
+            camera=camera,
+            size=size,
+            spp=spp,
+            scene=scene,
+            rotate=rotate,
+            component=component,
+            direct=direct,
+            renderer=renderer,
+        )
+
+    def truncated(self, components):
+        """The asset with the first so many components of distant transport: a smaller file, faster
+        and less exact.
+
+        >>> for d in (16, 32, 64):
+        ...     mi_prt.compare(asset.truncated(d), f"report-{d}")
+
+        Parameters
+        ----------
+        components : int
+            1…d, for spherical harmonics a square. All other transport stays as it is.
+
+        Returns
+        -------
+        Asset
+            Whose `captured_variance` and `relative_error` are those of what is left, summed from
+            the stored coefficients, and whose report says `truncated_from`.
+
+        Raises
+        ------
+        SettingsError
+            If there is no distant transport, the number is out of range, or the points do not share
+            components (the bases haar and none).
+        """
+        if "distant" not in self.transports:
+            raise SettingsError(
+                f"this asset, with transports {','.join(self.transports)}, has no components to cut"
+                " to: only distant transport has (--transports distant)"
+            )
+        cut = {k: t.truncated(components, self.points) for k, t in self.transports.items()}
+        settings = self.settings | {"coefficients": int(components)}
+        return replace(self, transports=cut, settings=settings, path=None)
 
     # --- what it holds ------------------------------------------------------------------------
 

@@ -1,5 +1,8 @@
 """What an asset holds."""
 
+from html import escape
+from pathlib import Path
+
 
 def describe_asset(asset):
     """What an asset holds, as plain data.
@@ -28,3 +31,30 @@ def describe_asset(asset):
         "versions": asset.versions,
         "report": asset.report | asset.points.report,
     }
+
+
+def _shown(asset):
+    """Name and value, both texts, of what is shown first."""
+    place = asset.scene["path"]
+    rows = [
+        ("scene", Path(place).name if place else f"a {asset.scene['kind']} in memory"),
+        ("points", f"{len(asset.points):,} {asset.settings['points']}"),
+    ]
+    rows += [(kind, transport.words) for kind, transport in asset.transports.items()]
+    if asset.path:
+        rows.append(("file", asset.path.name))
+    return rows
+
+
+def summary_line(asset):
+    """One line of what an asset holds."""
+    return f"<Asset {'; '.join(f'{name}: {value}' for name, value in _shown(asset))}>"
+
+
+def summary_table(asset):
+    """The same as a table of HTML."""
+    rows = "".join(
+        f"<tr><th style='text-align:left'>{escape(name)}</th><td>{escape(value)}</td></tr>"
+        for name, value in _shown(asset)
+    )
+    return f"<table><caption>mi_prt asset</caption>{rows}</table>"

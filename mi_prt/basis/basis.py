@@ -6,6 +6,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from ..errors import SettingsError
 from ..lighting.cells import cell_radiance
 from ..lighting.lattice import on_lattice
 from ..system.parallel import one_blas_thread
@@ -93,9 +94,29 @@ class Basis(ABC):
         with one_blas_thread():
             return self.project_light(cell_radiance(light, directions))
 
+    def project_all(self, lights, directions):
+        """Light (m, d, 3) and the mean's response (m, 3) of m `Light`s without local lights."""
+        projected = [self.project(light, directions) for light in lights]
+        return np.stack([light for light, _ in projected]), np.stack(
+            [mean for _, mean in projected]
+        )
+
     def prepare(self, light, directions):
         """A `Light` in a form that turns, and is projected, in milliseconds."""
         return on_lattice(light, directions)
+
+    def truncated(self, components):
+        """The basis of the first so many components, 1…d, by which coefficients stay what they are.
+
+        Raises
+        ------
+        SettingsError
+            If its components are not nested, or not in that number.
+        """
+        raise SettingsError(
+            f"the basis {self.kind} has no first {components:,} components that all points share:"
+            f" precompute the scene again with coefficients {components} (--coefficients)"
+        )
 
     # --- before there is one ------------------------------------------------------------------
 

@@ -15,7 +15,7 @@ from ..lighting.light import Light
 from ..lighting.part import DistantPart
 from ..lighting.rotation import rotation_matrix
 from ..lighting.values import rgb_factor
-from .basis import BASES, compute_anew
+from .basis import BASES, Basis, compute_anew
 from .linear import LinearBasis
 from .rows import Rows
 from .target import Fit, Target, centred, check_room, shares
@@ -211,6 +211,13 @@ class HarmonicBasis(LinearBasis):
         others = Light(p for p in light.parts if p not in known)
         coefficients, mean = super().project(others, directions)
         return sum((m.turned() for m in known), coefficients), mean
+
+    def truncated(self, components):
+        """See `Basis.truncated`: whole bands."""
+        _bands_of(components)
+        return super().truncated(components)
+
+    project_all = Basis.project_all  # by `project`, which knows maps that turn in closed form
 
     def prepare(self, light, directions):
         """A `Light` whose maps turn in closed form."""

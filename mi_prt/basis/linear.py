@@ -2,11 +2,13 @@
 shared wavelets have in common.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
+from ..lighting.cells import cell_radiance
+from ..system.parallel import one_blas_thread
 from ..system.schema import Array
 from .basis import Basis
 
@@ -123,6 +125,32 @@ class LinearBasis(Basis):
             [self.vectors[:, channel] @ weighted[:, channel] for channel in range(3)], axis=-1
         )
         return light, np.einsum("cs,sc->c", mean, weighted)
+
+    def truncated(self, components):
+        """See `Basis.truncated`: the first functions."""
+        return replace(
+            self,
+            vectors=self.vectors[:components].copy(),
+            captured_variance=self.captured_variance[:components].copy(),
+        )
+
+    def project_all(self, lights, directions):
+        """Light (m, d, 3) and the mean's response (m, 3) of m `Light`s, by one matrix product."""
+        radiance = np.stack([cell_radiance(light, directions) for light in lights], axis=1)
+        radiance *= self.sqrt_weights[:, None, None]
+        means = (self.mean * self.sqrt_weights).reshape(-1, len(self.sqrt_weights))
+        functions = self.vectors.reshape(len(self), *means.shape)
+        light = np.empty((len(lights), len(self), 3), np.float32)
+        response = np.empty((len(lights), 3), np.float32)
+        shape = len(lights), 3 // len(means)
+        with one_blas_thread():
+            for own, mean in enumerate(means):  # one for all channels, or one for each
+                channels = slice(own, None, len(means))
+                incoming = radiance[:, :, channels].reshape(len(radiance), -1)
+                projected = (functions[:, own] @ incoming).reshape(len(self), *shape)
+                light[:, :, channels] = projected.swapaxes(0, 1)
+                response[:, channels] = (mean @ incoming).reshape(shape)
+        return light, response
 
 
 class Span(LinearBasis):

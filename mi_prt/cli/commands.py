@@ -14,7 +14,9 @@ from .options import (
     Define,
     Direct,
     Environment,
+    Environments,
     Exposure,
+    Floor,
     Force,
     Frames,
     FramesPerSecond,
@@ -24,10 +26,11 @@ from .options import (
     OtherScene,
     Rotate,
     Seed,
-    Sensor,
+    Sensors,
     Size,
     Threads,
     Variant,
+    Viewpoint,
     flowing,
     with_settings,
 )
@@ -46,6 +49,26 @@ app = typer.Typer(
         " teapot.prt && mi-prt relight teapot.prt -o teapot.png --rotate y:45"
     ),
 )
+
+
+def _print_version(wanted: bool):
+    if wanted:
+        from .. import __version__
+
+        print(f"mi-prt {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", callback=_print_version, is_eager=True, help="Print the version."
+        ),
+    ] = False,
+):
+    """Options of the program itself."""
 
 
 @app.command(epilog="Example: mi-prt doctor --json")
@@ -71,30 +94,26 @@ def doctor(as_json: Json = False):
 @with_settings
 @flowing
 def info(
-    path: Annotated[Path, typer.Argument(help="A scene (XML) or an asset.")],
+    path: Annotated[Path, typer.Argument(help="A scene (XML), a mesh or an asset.")],
     settings: dict,
     define: Define = None,
     variant: Variant = None,
+    floor: Floor = False,
     as_json: Json = False,
 ):
     """Say what a scene requires and what precomputing it will cost, or what an asset holds."""
-    from ..asset.asset import load
-    from ..asset.container import is_asset
-    from ..asset.describe import describe_asset
-    from ..precompute.forecast import describe
+    from ..precompute.info import info as run
 
     take.use(None, variant)
-    if is_asset(path):
-        found = describe_asset(load(path))
-    else:
-        found = describe(path, take.parameters_of(define), **settings)
-    _show(found, as_json)
+    _show(run(path, take.parameters_of(define, floor), **settings), as_json)
 
 
 @app.command(
     epilog=(
         "Examples: mi-prt precompute scenes/teapot.xml -o teapot.prt --coefficients 96 -D"
         " spp=16\n\nmi-prt precompute scenes/day_room.xml -o room.prt   (its sky and its lamps)\n\n"
+        "mi-prt precompute scenes/meshes/teapot.ply -o teapot.prt --floor   (.ply, .obj, .glb,"
+        " .stl)\n\n"
         "mi-prt precompute scenes/teapot.xml -o teapot.prt --coefficients auto --variance 0.98"
         " --max-memory 2G --resume\n\nmi-prt precompute scenes/room.xml -o room.prt --transports"
         " own,local --points samples --count 45000"
@@ -103,7 +122,7 @@ def info(
 @with_settings
 @flowing
 def precompute(
-    scene: Annotated[Path, typer.Argument(help="A Mitsuba XML file.")],
+    scene: Annotated[Path, typer.Argument(help="A Mitsuba XML file or a mesh.")],
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="FILE", help="The asset to write.")
     ],
@@ -122,6 +141,7 @@ def precompute(
     threads: Threads = None,
     variant: Variant = None,
     define: Define = None,
+    floor: Floor = False,
     as_json: Json = False,
 ):
     """Precompute a scene's transport into one file.
@@ -140,7 +160,7 @@ def precompute(
     with progress_bar(kept=f"{output}.partial") as progress:
         asset, cost = measure(
             scene,
-            take.parameters_of(define),
+            take.parameters_of(define, floor),
             progress,
             output,
             resume,
@@ -169,7 +189,9 @@ def precompute(
         "Examples: mi-prt relight teapot.prt -o teapot.png --envmap sky.exr --rotate y:90 --size"
         " 640x480\n\nmi-prt relight room.prt -o dusk.png --light 'scene:sky_1*0.05' --light"
         " scene:floor_lamp\n\nmi-prt relight room.prt -o lamp.png --light point:0,1.5,0:8,7,6"
-        " --component indirect\n\nmi-prt relight room.prt -o walk.mp4 --light point:0,1.5,0:8,7,6"
+        " --component indirect\n\nmi-prt relight teapot.prt -o 'out/{map}_{sensor}.png' --envmap"
+        " skies --sensor all\n\nmi-prt relight teapot.prt -o near.png --camera 0,2,6:0,0.5,0:45"
+        "\n\nmi-prt relight room.prt -o walk.mp4 --light point:0,1.5,0:8,7,6"
         " --light-path '-1,1.5,0 1,1.5,0 1,1.5,1' --renderer raster"
     )
 )
@@ -182,14 +204,16 @@ def relight(
             "-o",
             "--output",
             metavar="OUT",
-            help=".exr, .png, .ply or .npz; of a film .mp4, .gif or frame-%03d.png",
+            help=".exr, .png, .ply or .npz; of a film .mp4, .gif or frame-%03d.png; of several maps"
+            " or sensors with {map} and {sensor} in its name",
         ),
     ],
-    envmap: Environment = None,
+    envmap: Environments = None,
     light: Lights = None,
     nearest: Nearest = None,
     rotate: Rotate = None,
-    sensor: Sensor = 0,
+    sensor: Sensors = None,
+    camera: Viewpoint = None,
     size: Size = None,
     renderer: Annotated[
         str, typer.Option("--renderer", metavar="mitsuba|raster", help="How pictures are drawn.")
@@ -219,15 +243,15 @@ def relight(
     """
     from ..asset.asset import load
     from ..output.film import light_path as path_of
+    from ..output.many import ALL, map_files, relight_many
     from ..output.moving import animate
-    from ..output.relight import relight_to_file
 
     take.use(threads, variant)
-    chosen, turned = take.light_of(envmap, light), take.rotation_of(rotate)
+    maps, sensors = map_files(envmap or []), take.sensors_of(sensor, camera)
+    turned = take.rotation_of(rotate)
     asset = load(asset_path)
     shown = {
         "scene": scene,
-        "sensor": sensor,
         "size": take.size_of(size),
         "renderer": renderer,
         "spp": spp,
@@ -239,13 +263,33 @@ def relight(
     }
     film = {k: v for k, v in (("frames", frames), ("fps", fps)) if v is not None}
     if light_path is not None:
+        if len(maps) > 1 or sensors == ALL:
+            raise SettingsError(
+                "--light-path makes one film: give one --envmap at most, and one --sensor"
+            )
         path = path_of(light_path)
+        chosen = take.light_of(maps[0] if maps else None, light)
         with progress_bar() as progress:
-            result = animate(asset, output, path, light=chosen, progress=progress, **film, **shown)
+            result = animate(
+                asset,
+                output,
+                path,
+                light=chosen,
+                sensor=sensors[0],
+                progress=progress,
+                **film,
+                **shown,
+            )
     elif film:
         raise SettingsError("--frames and --fps are of a film: give --light-path as well")
     else:
-        result = relight_to_file(asset, output, chosen, nearest=nearest, **shown)
+        lights = take.light_of(None, light)
+        files = relight_many(asset, output, maps, sensors, lights, nearest=nearest, **shown)
+        if len(files) > 1:
+            _show({"files": files}, as_json)
+            return
+        output = files[0].pop("file")
+        result = {k: v for k, v in files[0].items() if k not in ("map", "sensor")}
     _show(result if as_json else {"wrote": str(output)} | result, as_json)
 
 
@@ -266,7 +310,8 @@ def compare(
     light: Lights = None,
     nearest: Nearest = None,
     rotate: Rotate = None,
-    sensor: Sensor = 0,
+    sensor: Sensors = None,
+    camera: Viewpoint = None,
     size: Size = None,
     spp: Annotated[int, typer.Option("--spp", help="Samples per pixel of the reference.")] = 256,
     reference: Annotated[
@@ -290,6 +335,9 @@ def compare(
     from ..evaluate.compare import compare as run
 
     take.use(threads, variant)
+    sensors = take.sensors_of(sensor, camera)
+    if sensors == "all":
+        raise SettingsError("--sensor all is of relight: a report has one picture, give an index")
     asset = load(asset_path)
     with progress_bar() as progress:
         result = run(
@@ -298,7 +346,7 @@ def compare(
             take.light_of(envmap, light),
             rotate=take.rotation_of(rotate),
             scene=scene,
-            sensor=sensor,
+            sensor=sensors[0],
             size=take.size_of(size),
             spp=spp,
             reference=reference,

@@ -45,12 +45,29 @@ Variant = Annotated[
 ]
 Define = Annotated[
     list[str] | None,
-    typer.Option("-D", metavar="NAME=VALUE", help="Value for a <default> parameter of the XML."),
+    typer.Option(
+        "-D",
+        metavar="NAME=VALUE",
+        help="Value for a <default> parameter of the XML; of a mesh normals=flat, up=z, grey=0.5.",
+    ),
 ]
+Floor = Annotated[bool, typer.Option("--floor", help="Put a grey floor under a mesh.")]
 Environment = Annotated[
     Path | None,
     typer.Option(
-        "--envmap", metavar="EXR", help="Environment map; default: the scene's own light."
+        "--envmap",
+        metavar="MAP",
+        help="Environment map (+y is up): .exr, .hdr, .pfm, .png and others; default: the scene's"
+        " own light.",
+    ),
+]
+Environments = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--envmap",
+        metavar="MAP",
+        help="Environment map (+y is up), or a folder of them; may be repeated: each gives a file,"
+        " see -o. Default: the scene's own light.",
     ),
 ]
 Lights = Annotated[
@@ -100,7 +117,20 @@ OtherScene = Annotated[
     Path | None,
     typer.Option("--scene", metavar="SCENE", help="The asset's scene, if it is elsewhere by now."),
 ]
-Sensor = Annotated[int, typer.Option("--sensor", help="Index of the scene's sensor.")]
+Sensors = Annotated[
+    str | None,
+    typer.Option(
+        "--sensor", metavar="N|all", help="Index of the scene's sensor [0], or all, see -o."
+    ),
+]
+Viewpoint = Annotated[
+    str | None,
+    typer.Option(
+        "--camera",
+        metavar="FROM:TO[:FOV[:UP]]",
+        help="A camera of your own, such as 0,2,6:0,0.5,0:45; FOV in degrees, UP x, y or z.",
+    ),
+]
 Size = Annotated[
     str | None, typer.Option("--size", metavar="WxH", help="Image size; default: the sensor's.")
 ]
@@ -177,9 +207,9 @@ def _shown(value):
 # --- what the user passes ------------------------------------------------------------------------
 
 
-def parameters_of(define):
-    """Values for `<default>` parameters from NAME=VALUE texts."""
-    parameters = {}
+def parameters_of(define, floor=False):
+    """Values for `<default>` parameters, or of a mesh, from NAME=VALUE texts and --floor."""
+    parameters = {"floor": "on"} if floor else {}
     for entry in define or []:
         name, equals, value = entry.partition("=")
         if not (name and equals):
@@ -201,6 +231,21 @@ def rotation_of(text):
     from ..lighting.parse import parse_rotation
 
     return None if text is None else parse_rotation(text)
+
+
+def sensors_of(sensor, camera) -> Any:
+    """Sensors from --sensor and --camera: a sequence of int or Camera, or 'all'."""
+    from ..scene.camera import Camera
+
+    if camera is not None:
+        if sensor is not None:
+            raise SettingsError("--sensor and --camera both choose what is seen: give one of them")
+        return (Camera.parse(camera),)
+    if sensor in (None, "all"):
+        return (0,) if sensor is None else sensor
+    if not sensor.isdecimal():
+        raise SettingsError(f"--sensor must be the index of a sensor, or all, got '{sensor}'")
+    return (int(sensor),)
 
 
 def size_of(text):

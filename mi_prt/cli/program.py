@@ -42,7 +42,7 @@ def main(arguments=None):
 def _code_of(arguments):
     """The exit code of a command; a line on stderr where it failed."""
     try:
-        if arguments and not {"-h", "--help"} & set(arguments):
+        if arguments and not {"-h", "--help", "--version"} & set(arguments):
             from ..system.runtime import quiet_mitsuba
 
             quiet_mitsuba()

@@ -82,12 +82,9 @@ def split(quadrature, directions, at):
     beyond it (s, 3), and its first moment (s, 3, 3), channels first.
     """
     w = directions.solid_angles[:, None]
-    groups, order, starts, filled = _groups(quadrature, directions)
-    solid_angles = quadrature.solid_angles.astype(np.float64)
-    covered = groups @ solid_angles[:, None]
-    reach = groups @ (solid_angles[:, None] * quadrature.vectors)
+    groups, order, starts, filled, covered, reach = _groups(quadrature, directions)
     energy = groups @ quadrature.energy.astype(np.float64)
-    moments = (groups @ quadrature.moments.reshape(-1, 9).astype(np.float64)).reshape(-1, 3, 3)
+    moments = quadrature.moments_in(order, groups.indptr)
     dimmest = np.empty((len(directions), 3))
     dimmest[filled] = np.minimum.reduceat(quadrature.radiance[order], starts, axis=0)
     if not filled.all():
@@ -108,18 +105,23 @@ def _is_astray(toward, middles, count):
 
 def _groups(quadrature, directions):
     """Samples by cells: the matrix (s, k) that sums them; their order, where the cells start in it,
-    and which cells (s,) have any.
+    which cells (s,) have any, and of each cell the solid angle (s, 1) and its moment (s, 3).
     """
     if quadrature.place is None:
-        return _grouped(quadrature.vectors, directions)
+        return _grouped(quadrature, directions)
     return _grouped_once(_Placed(quadrature), directions)
 
 
 class _Placed:
-    """A quadrature's vectors, equal where its place is."""
+    """Where samples are: equal where their place is. It is kept, and the samples are not."""
 
     def __init__(self, quadrature):
-        self.vectors, self._place = quadrature.vectors, quadrature.place
+        self._quadrature, self._place = quadrature, quadrature.place
+
+    def take(self):
+        """The samples, once."""
+        quadrature, self._quadrature = self._quadrature, None
+        return quadrature
 
     def __eq__(self, other):
         return self._place == other._place
@@ -130,10 +132,11 @@ class _Placed:
 
 @lru_cache(_KEPT)
 def _grouped_once(placed, directions):
-    return _grouped(placed.vectors, directions)
+    return _grouped(placed.take(), directions)
 
 
-def _grouped(vectors, directions):
+def _grouped(quadrature, directions):
+    vectors, solid_angles = quadrature.vectors, quadrature.solid_angles.astype(np.float64)
     cells = directions.cells(vectors)
     order = np.argsort(cells, kind="stable")
     numbers = np.bincount(cells, minlength=len(directions))
@@ -141,4 +144,6 @@ def _grouped(vectors, directions):
     ones = np.ones(len(cells), np.float32)
     groups = scipy.sparse.csr_matrix((ones, order, ends), (len(directions), len(cells)))
     filled = numbers > 0
-    return groups, order, ends[:-1][filled], filled
+    covered = groups @ solid_angles[:, None]
+    reach = groups @ (solid_angles[:, None] * vectors)
+    return groups, order, ends[:-1][filled], filled, covered, reach

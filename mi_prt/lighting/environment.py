@@ -12,6 +12,7 @@ import numpy as np
 from ..errors import LightError
 from ..system.runtime import mitsuba
 from .average import average, sample_spacing
+from .kept import kept_means
 from .map_file import read_pixels
 from .part import LIGHTS, DistantPart
 from .quadrature import of_map
@@ -49,6 +50,7 @@ class EnvironmentMap(DistantPart):
     Attributes
     ----------
     pixels : (h, w, 3) float32
+        Read-only, as means over cells are computed once for each map; `mi.Bitmap` takes a copy.
     negative_pixels : int
         Pixels in which a negative value was set to zero.
 
@@ -71,6 +73,7 @@ class EnvironmentMap(DistantPart):
 
     def __post_init__(self):
         pixels, negative = _validated(read_pixels(self.source), self.scale)
+        pixels.flags.writeable = False
         object.__setattr__(self, "pixels", pixels)
         object.__setattr__(self, "negative_pixels", negative)
         object.__setattr__(
@@ -99,6 +102,7 @@ class EnvironmentMap(DistantPart):
             pixels = self.pixels * rgb_factor(factor).astype(np.float32)
         if not np.isfinite(pixels).all():
             raise LightError(f"an environment map times {factor} is not finite in float32")
+        pixels.flags.writeable = False
         dimmed = copy(self)
         object.__setattr__(dimmed, "pixels", pixels)
         object.__setattr__(dimmed, "source", pixels)
@@ -120,12 +124,15 @@ class EnvironmentMap(DistantPart):
         to_world[:3, :3] = self.rotation
         return {
             "type": "envmap",
-            "bitmap": mi.Bitmap(self.pixels),
+            "bitmap": mi.Bitmap(self.pixels.copy()),  # Mitsuba refuses read-only arrays
             "to_world": mi.ScalarTransform4f(to_world),
         }
 
     def radiance(self, directions, samples_per_side):
-        """See `DistantPart.radiance`."""
+        """See `DistantPart.radiance`; read-only, and computed once for each lattice."""
+        return kept_means(self, directions, samples_per_side, self._averaged)
+
+    def _averaged(self, directions, samples_per_side):
         spacing = sample_spacing(directions, samples_per_side)
         return average(self.quadrature(spacing), directions, self.at)
 

@@ -11,6 +11,9 @@ from ..system.workers import a_worker_at_least
 
 _COLOURS = "RGB", "XYZ", "Y"  # names of channels of which Mitsuba makes colours
 
+# what OpenEXR and Mitsuba read
+ENDINGS = (".exr", ".hdr", ".rgbe", ".pfm", ".ppm", ".png", ".jpg", ".jpeg", ".tga", ".bmp")
+
 
 def read_pixels(source):
     """Pixels of a path, a mi.Bitmap or whatever NumPy takes, not checked; see `EnvironmentMap`."""

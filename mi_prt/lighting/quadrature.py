@@ -3,15 +3,47 @@
 from collections.abc import Hashable
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import scipy.sparse
 
+from ..system.parallel import one_blas_thread
+
 _KEPT = 4  # sizes of maps whose grids are kept
 
 
+class Samples:
+    """What quadratures have in common; see `Quadrature` for what they hold."""
+
+    vectors: Any
+    solid_angles: Any
+    energy: Any
+    moments: Any
+    place: Hashable
+
+    def moments_in(self, order, ends):
+        """First moments (s, 3, 3) float64 of s groups, channels first.
+
+        Parameters
+        ----------
+        order : (k,) int
+            Samples by groups.
+        ends : (s + 1,) int
+            Where groups begin and end in `order`.
+        """
+        ones = np.ones(len(order), np.float32)
+        groups = scipy.sparse.csr_matrix((ones, order, ends), (len(ends) - 1, len(order)))
+        return (groups @ self.moments.reshape(-1, 9).astype(np.float64)).reshape(-1, 3, 3)
+
+    @property
+    def radiance(self):
+        """Mean radiance (k, 3) of each piece."""
+        return self.energy / self.solid_angles[:, None]
+
+
 @dataclass(frozen=True, eq=False)
-class Quadrature:
+class Quadrature(Samples):
     """Light in k pieces of the sphere.
 
     Parameters
@@ -34,11 +66,6 @@ class Quadrature:
     moments: np.ndarray
     place: Hashable = None
 
-    @property
-    def radiance(self):
-        """Mean radiance (k, 3) of each piece."""
-        return self.energy / self.solid_angles[:, None]
-
 
 def of_map(pixels, rotation, spacing):
     """The quadrature of an equirectangular map in Mitsuba's convention.
@@ -55,7 +82,8 @@ def of_map(pixels, rotation, spacing):
 
     Returns
     -------
-    Quadrature
+    Samples
+        With what a Quadrature holds.
     """
     return _grid(*pixels.shape[:2], float(spacing)).quadrature(pixels, np.asarray(rotation))
 
@@ -136,7 +164,8 @@ class _Grid:
     def __init__(self, height, width, spacing):
         self._key = height, width, spacing
         self._down, self._across = _around_pole(height, spacing), _around_y(width, spacing)
-        theta, phi = self._down.middles[:, None], self._across.middles
+        # column by column
+        theta, phi = self._down.middles, self._across.middles[:, None]
         up, around = (np.sin(theta), np.cos(theta)), (np.sin(phi), -np.cos(phi))
         self._vectors = _stacked(around[0] * up[0], up[1], around[1] * up[0])
         self._tangents = (
@@ -144,7 +173,7 @@ class _Grid:
             _stacked(-around[1] * up[0], 0.0, around[0] * up[0]),
         )
         self._solid_angles = (
-            (self._down.sizes[:, None] * self._across.sizes).ravel().astype(np.float32)
+            (self._across.sizes[:, None] * self._down.sizes).ravel().astype(np.float32)
         )
 
     def quadrature(self, pixels, rotation):
@@ -152,24 +181,62 @@ class _Grid:
         height, width, _ = pixels.shape
         down, across = self._down, self._across
 
-        def along(matrix, rows):  # (m, w, 3) to (m, m', 3)
-            turned = rows.transpose(1, 0, 2).reshape(width, -1)
-            return (matrix @ turned).reshape(matrix.shape[0], -1, 3).transpose(1, 0, 2)
+        def columns(matrix):  # of summed rows: (w, m·3)
+            rows = (matrix @ pixels.reshape(height, -1)).reshape(-1, width, 3)
+            return np.ascontiguousarray(rows.transpose(1, 0, 2)).reshape(width, -1)
 
-        flat = pixels.reshape(height, -1)
-        rows = (down.zeroth @ flat).reshape(-1, width, 3)
-        energy = along(across.zeroth, rows).reshape(-1, 3)
-        moments = energy[:, :, None] * self._vectors[:, None]
+        straight = columns(down.zeroth)
+        energy = (across.zeroth @ straight).reshape(-1, 3)
+        terms = [(energy, self._vectors)]
         if down.sums or across.sums:
-            tilted = (down.first @ flat).reshape(-1, width, 3)
-            for offset, tangent in zip(
-                (along(across.zeroth, tilted), along(across.first, rows)), self._tangents
-            ):
-                moments += offset.reshape(-1, 3)[:, :, None] * tangent[:, None]
+            offsets = across.zeroth @ columns(down.first), across.first @ straight
+            terms += [(o.reshape(-1, 3), tangent) for o, tangent in zip(offsets, self._tangents)]
         turn = rotation.T.astype(np.float32)
-        moments = (moments.reshape(-1, 3) @ turn).reshape(-1, 3, 3)
         place = (*self._key, rotation.tobytes())
-        return Quadrature(self._vectors @ turn, self._solid_angles, energy, moments, place)
+        return _MapQuadrature(self._solid_angles, energy, terms, turn, place)
+
+
+class _MapQuadrature(Samples):
+    """That of a map. Its moments are the sum of products of light and vectors, in the map's frame;
+    these and the vectors are written out only where they are asked for one by one.
+
+    Parameters
+    ----------
+    terms : list of ((k, 3), (k, 3))
+        Light, and vectors that it is multiplied with; of the first, those of the samples.
+    turn : (3, 3) float32
+        From the map's frame, vectors as rows.
+    """
+
+    def __init__(self, solid_angles, energy, terms, turn, place):
+        self.solid_angles, self.energy, self.place = solid_angles, energy, place
+        self._terms, self._turn = terms, turn
+
+    @property
+    def vectors(self):
+        """See `Quadrature`."""
+        with one_blas_thread():
+            return self._terms[0][1] @ self._turn
+
+    @property
+    def moments(self):
+        """See `Quadrature`."""
+        found = np.zeros((len(self.energy), 3, 3), np.float32)
+        for light, vectors in self._terms:
+            found += light[:, :, None] * vectors[:, None]
+        with one_blas_thread():
+            return (found.reshape(-1, 3) @ self._turn).reshape(-1, 3, 3)
+
+    def moments_in(self, order, ends):
+        """See `Quadrature.moments_in`."""
+        shape = (len(ends) - 1, len(order))
+        found = np.zeros((shape[0], 3, 3))
+        for light, vectors in self._terms:
+            light = light.astype(np.float64)
+            for axis, values in enumerate(vectors.T):
+                weighted = scipy.sparse.csr_matrix((values[order], order, ends), shape)
+                found[:, :, axis] += weighted @ light
+        return found @ self._turn
 
 
 def _stacked(x, y, z):

@@ -101,6 +101,13 @@ class LightPath:
         return CubicHermiteSpline(knots, self.keys, tangents)(places)
 
 
+def as_path(path):
+    """A LightPath from one, from its text, or from positions (k, 3)."""
+    if isinstance(path, LightPath):
+        return path
+    return light_path(path) if isinstance(path, str) else LightPath(np.asarray(path))
+
+
 def light_path(text):
     """The path of a moving light from its key positions as text, for example '0,1,0 1,1,0 1,1,1'.
 

@@ -12,7 +12,7 @@ from ..render.integrator import check_direct
 from ..render.picture import RENDERERS, Picture
 from ..render.rendered import check_picture
 from ..transport.transport import Question
-from .film import FPS, FRAMES, check_frames_output, write_frames
+from .film import FPS, FRAMES, as_path, check_frames_output, write_frames
 
 FRAME_SAMPLES = 1  # of a frame's pixel, along each side, of splats
 
@@ -43,7 +43,8 @@ def animate(
     asset : Asset
     output : path
         .mp4 or .gif, or .png with the number of the frame in its name, such as frame-%03d.png.
-    path : LightPath
+    path : LightPath, (k, 3), or text
+        Positions that the light goes through, such as '0,1,0 1,1,0 1,1,1'.
     frames, fps : int
     light : what `as_light` accepts, or a list of such
         Whose first point, spot or area light moves; all else stays.
@@ -60,7 +61,7 @@ def animate(
     check_picture(size, sensor, spp)
     check_direct(direct)
     Question(Light(()), component)  # which checks it
-    places = path.positions(frames)
+    places = as_path(path).positions(frames)
     check_frames_output(output, fps, frames, force)
     opened = open_scene_of(asset, scene)
     moving = _Moving(asset.resolved(light, rotate, opened))

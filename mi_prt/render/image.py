@@ -3,6 +3,7 @@
 from contextlib import contextmanager
 
 from ..errors import SettingsError
+from ..scene.camera import Camera
 from ..system.runtime import mitsuba
 from .developed import developed
 from .integrator import integrator_for
@@ -41,18 +42,20 @@ def render_image(asset, mi_scene, sensor, spp=64, seed=0, irradiance=None, direc
 
 
 def pick_sensor(mi_scene, index):
-    """Sensor of a scene by its index.
+    """Sensor of a scene by its index, or that of a `Camera`.
 
     Raises
     ------
     SettingsError
         If there is none of that index.
     """
+    if isinstance(index, Camera):
+        return mitsuba().load_dict(index.to_mitsuba())
     sensors = mi_scene.sensors()
     if not sensors:
         raise SettingsError(
-            "the scene has no sensor: add one to it, or ask for .ply or .npz output, which needs"
-            " none"
+            "the scene has no sensor: give a camera (--camera 0,2,6:0,0,0), add a sensor to the"
+            " scene, or ask for .ply or .npz output, which needs none"
         )
     if not 0 <= index < len(sensors):
         raise SettingsError(

@@ -5,6 +5,7 @@ from functools import reduce
 import numpy as np
 
 from ..errors import SceneError, SettingsError
+from ..scene.camera import Camera
 from ..system.passing import one_line
 from ..system.runtime import mitsuba
 from ..system.whole import check_whole
@@ -73,7 +74,8 @@ def check_picture(size=None, sensor=0, spp=1, seed=0):
     Parameters
     ----------
     size : (width, height) or None
-    sensor, spp, seed : int
+    sensor : int or Camera
+    spp, seed : int
 
     Raises
     ------
@@ -81,7 +83,8 @@ def check_picture(size=None, sensor=0, spp=1, seed=0):
         If one of them is out of range for any scene.
     """
     check_samples(spp)
-    check_whole("sensor", sensor, 0, MAX_SENSORS)
+    if not isinstance(sensor, Camera):
+        check_whole("sensor", sensor, 0, MAX_SENSORS)
     check_whole("seed", seed, 0, MAX_SEED)
     if size is not None:
         if not isinstance(size, tuple | list) or len(size) != 2:

@@ -16,6 +16,7 @@ from ..system.workers import a_worker_at_least
 from .bounds import bounds_of, scale_of, warn_if_far
 from .interactions import make_interactions
 from .mesh import mesh_arrays
+from .mesh_scene import is_mesh_file, is_mesh_object, mesh_scene
 from .own_lights import list_own_lights
 from .rebuild import check_can_be_copied, kept_parts, rebuilt_scene
 from .surface import list_surfaces
@@ -29,6 +30,7 @@ class SceneSource:
     Parameters
     ----------
     kind : 'file', 'dict' or 'object'
+        A trimesh object counts as a dict: both are opened again from what was given.
     path : str or None
         Absolute path of a file.
     parameters : dict
@@ -36,7 +38,7 @@ class SceneSource:
     is_relative : bool
         Whether the path was given relative to the working directory.
     content : dict or mi.Scene or None
-        The dict or scene itself; not written to assets.
+        The dict, scene or mesh itself; not written to assets.
     """
 
     kind: str
@@ -205,10 +207,11 @@ def open_scene(source, parameters=None):
 
     Parameters
     ----------
-    source : path, dict or mi.Scene
-        A Mitsuba XML file, a scene dict (`type: scene`) or a loaded scene.
+    source : path, dict, mi.Scene, trimesh.Trimesh or trimesh.Scene
+        A Mitsuba XML file, a scene dict (`type: scene`), a loaded scene, or a mesh (.ply, .obj,
+        .glb, .stl, or of trimesh), which is diffuse and comes without light: see `mesh_scene`.
     parameters : dict, optional
-        Values for an XML file's `<default>` parameters.
+        Values for an XML file's `<default>` parameters; of a mesh floor, normals, up and grey.
 
     Returns
     -------
@@ -225,15 +228,24 @@ def open_scene(source, parameters=None):
     if isinstance(source, mi.Scene):
         return Scene(source, SceneSource("object", content=source))
     parameters = {str(k): str(v) for k, v in (parameters or {}).items()}
+    if is_mesh_object(source):
+        loaded = _loaded("the mesh", mi.load_dict, mesh_scene(source, parameters))
+        return Scene(loaded, SceneSource("dict", None, parameters, content=source))
     if isinstance(source, dict):
         loaded = _loaded("the scene dict", mi.load_dict, source)
         return Scene(loaded, SceneSource("dict", content=source))
     if not isinstance(source, str | os.PathLike):
-        raise SceneError(f"a scene is a path, a dict or an mi.Scene, got {type(source).__name__}")
+        raise SceneError(
+            "a scene is a path, a dict, an mi.Scene or a trimesh object, got"
+            f" {type(source).__name__}"
+        )
     path = Path(source).absolute()
     if reason := why_no_file(path):
-        raise SceneError(f"scene '{path}' {reason}: give a Mitsuba XML file")
-    loaded = _loaded(f"scene '{path}'", mi.load_file, str(path), **parameters)
+        raise SceneError(f"scene '{path}' {reason}: give a Mitsuba XML file or a mesh")
+    if is_mesh_file(path):
+        loaded = _loaded(f"mesh '{path}'", mi.load_dict, mesh_scene(path, parameters))
+    else:
+        loaded = _loaded(f"scene '{path}'", mi.load_file, str(path), **parameters)
     return Scene(loaded, SceneSource("file", str(path), parameters, not Path(source).is_absolute()))
 
 

@@ -1,12 +1,13 @@
 """Transport of distant light: a basis, and the coefficients of all points (Eigentransport)."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from ..basis.basis import BASES
 from ..basis.compressed import Compressed
+from ..basis.truncated import truncated
 from ..directions import parse_directions
 from ..errors import SettingsError
 from ..lighting.emission import emission_of
@@ -63,36 +64,64 @@ class DistantTransport(Transport):
         return self.report["bounces"] != 0
 
     @property
+    def words(self):
+        """See `Transport.words`."""
+        captured = self.report["captured_variance"]
+        return (
+            f"{len(self.basis):,} coefficients ({self.basis.kind}) on {self.directions},"
+            f" {100 * captured:.1f} % of the variance"
+        )
+
+    @property
     def components(self):
         """All, or the total alone where direct light was not kept apart."""
         return COMPONENTS if self.direct is not None or not self.reflects else ("total",)
 
     def respond(self, points, question):
         """See `Transport.respond`."""
-        if question.component == "total":
-            return self._irradiance(self.total, points, question)
+        return self.respond_all(points, [question])[0]
+
+    def respond_all(self, points, questions):
+        """See `Transport.respond_all`; all of one component."""
+        component = questions[0].component
+        if component == "total":
+            return self._irradiance(self.total, points, questions)
         if not self.reflects:
-            if question.component == "direct":
-                return self._irradiance(self.total, points, question)
-            return np.zeros((len(points), 3), np.float32)
+            if component == "direct":
+                return self._irradiance(self.total, points, questions)
+            return np.zeros((len(questions), len(points), 3), np.float32)
         if self.direct is None:
             raise SettingsError(
-                f"component '{question.component}': this asset holds direct and reflected distant"
+                f"component '{component}': this asset holds direct and reflected distant"
                 " light in one; precompute it with keep_direct (--keep-direct) to tell them apart"
             )
-        total = self._irradiance(self.total, points, question)
-        direct = np.minimum(self._irradiance(self.direct, points, question), total)
-        return direct if question.component == "direct" else total - direct
+        total = self._irradiance(self.total, points, questions)
+        direct = np.minimum(self._irradiance(self.direct, points, questions), total)
+        return direct if component == "direct" else total - direct
 
-    def _irradiance(self, transport, points, question):
-        """Irradiance (n, 3); what compression leaves below zero of the sum is zero."""
-        light = question.light
-        irradiance = transport.respond(*transport.basis.project(light.distant, self.directions))
-        for cells, shares, strength in arrival(
-            emission_of(light.local), points.positions, self.directions, question.nearest
-        ):
-            irradiance += strength * transport.in_cells(cells, shares)
+    def _irradiance(self, transport, points, questions):
+        """Irradiance (m, n, 3); what compression leaves below zero of the sums is zero."""
+        lights = [question.light.distant for question in questions]
+        irradiance = transport.respond_all(*transport.basis.project_all(lights, self.directions))
+        for of_light, question in zip(irradiance, questions):
+            for cells, shares, strength in arrival(
+                emission_of(question.light.local),
+                points.positions,
+                self.directions,
+                question.nearest,
+            ):
+                of_light += strength * transport.in_cells(cells, shares)
         return np.maximum(irradiance, 0, out=irradiance)
+
+    def truncated(self, components, points):
+        """See `Transport.truncated`; the report says what is still captured."""
+        kept = ~points.buried if not points.buried.all() else points.buried
+        total, quality = truncated(self.total, components, kept, self.report)
+        direct = self.direct
+        if direct is not None and len(direct.basis) > components:
+            direct = truncated(direct, components, kept, self.report)[0]
+        report = self.report | quality | {"truncated_from": len(self.basis)}
+        return replace(self, total=total, direct=direct, report=report)
 
     def prepare(self, light):
         """Maps on a fine lattice; spherical harmonics turn them in closed form."""

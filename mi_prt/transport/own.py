@@ -51,6 +51,11 @@ class OwnTransport(Transport):
         """Names of the lamps, in the order of the columns."""
         return tuple(lamp["name"] for lamp in self.lamps)
 
+    @property
+    def words(self):
+        """See `Transport.words`."""
+        return f"lamps {', '.join(self.names)}"
+
     # --- relighting ---------------------------------------------------------------------------
 
     @classmethod

@@ -112,7 +112,7 @@ class Transport(ABC):
         return None
 
     @abstractmethod
-    def respond(self, points, question):
+    def respond(self, points, question) -> np.ndarray:
         """Irradiance at the points.
 
         Parameters
@@ -132,9 +132,28 @@ class Transport(ABC):
             If it does not hold the component.
         """
 
+    def respond_all(self, points, questions):
+        """Irradiance (m, n, 3) float32, the answers to m questions; see `respond`."""
+        return np.stack([self.respond(points, question) for question in questions])
+
+    def truncated(self, components, points):
+        """The transport with fewer components, where it has a number of them that can be chosen.
+
+        Raises
+        ------
+        SettingsError
+            If it cannot be had in that number.
+        """
+        return self
+
     def prepare(self, light):
         """Light in a form that turns, and is projected, in milliseconds; a Light."""
         return light
+
+    @property
+    def words(self):
+        """What it holds, in a few words."""
+        return self.takes_words
 
     @property
     def channels(self):
