@@ -74,7 +74,7 @@ def test_light_that_cannot_be_used_is_refused_before_any_work(run):
 
 def test_a_film_without_pixels_is_refused_unless_a_size_is_given(tmp_path):
     asset = mi_prt.precompute(case("robust_film_0"), **TINY)
-    with pytest.raises(SettingsError, match="0x0 pixels.*--size"):
+    with pytest.raises(SettingsError, match="0x0.*--size"):
         mi_prt.relight_to_file(asset, tmp_path / "a.png", spp=1)
     mi_prt.relight_to_file(asset, tmp_path / "a.png", spp=1, size=(8, 6))
 

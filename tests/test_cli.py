@@ -163,7 +163,7 @@ def test_relight_writes_every_format(asset, tmp_path, capsys):
             *extra,
         )
         result = json.loads(out)
-        assert code == 0 and set(result) == {"points", "seconds"}
+        assert code == 0 and set(result) == {"points", "exposure", "seconds"}
         assert set(result["seconds"]) == {"relight", "render"}
         assert (tmp_path / name).stat().st_size > 100
     with OpenEXR.File(str(tmp_path / "a.exr")) as file:

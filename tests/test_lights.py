@@ -540,7 +540,7 @@ def test_relighting_warns_and_does_not_measure(room, tmp_path, monkeypatch, name
         result = mi_prt.relight_to_file(
             room, tmp_path / name, PointLight([0.3, 1, 0], 5), scene=content, size=(16, 12), spp=2
         )
-    assert set(result) == {"points", "seconds"}
+    assert set(result) == {"points", "exposure", "seconds"}
     assert len([w for w in caught if issubclass(w.category, LightWarning)]) == 1
 
 
@@ -801,7 +801,7 @@ def test_lights_of_the_command_line_add_up(files, tmp_path, capsys):
         code, out, err = run(
             capsys, "relight", files / "a.prt", "-o", tmp_path / "a.npz", "--json", *arguments
         )
-        assert code == 0 and err == "" and set(json.loads(out)) == {"points", "seconds"}
+        assert code == 0 and err == "" and set(json.loads(out)) == {"points", "exposure", "seconds"}
         return np.load(tmp_path / "a.npz")["irradiance"].astype(np.float64)
 
     parts = [irradiance("--light", spec) for spec in specs] + [
@@ -853,7 +853,7 @@ def test_a_lamp_inside_the_hull_is_warned_of_in_one_line(files, tmp_path, capsys
         capsys, "relight", files / "a.prt", "-o", tmp_path / "a.ply", "--json", *light
     )
     result = json.loads(out)
-    assert code == 0 and set(result) == {"points", "seconds"}
+    assert code == 0 and set(result) == {"points", "exposure", "seconds"}
     assert len(err.splitlines()) == 1 and "lies inside the convex hull of the scene" in err
 
 

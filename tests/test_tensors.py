@@ -109,7 +109,7 @@ def test_a_reader_of_ten_lines(path):
             v for (v,) in struct.iter_unpack("<" + letters[entry["dtype"]], content[start:stop])
         ]
         assert values == ARRAYS[name].ravel().tolist() and entry["shape"] == [*ARRAYS[name].shape]
-    assert (metadata["format"], metadata["format_version"]) == ("mi_prt asset", "5")
+    assert (metadata["format"], metadata["format_version"]) == ("mi_prt asset", "6")
     assert json.loads(metadata["mi_prt"]) == HEADER and header.keys() == ARRAYS.keys()
 
 
@@ -366,7 +366,7 @@ def test_every_truncation_is_refused(path):
     ("version", "message"),
     [
         ("4", "older version.*precompute it again"),
-        ("6", "newer version.*update mi_prt"),
+        ("7", "newer version.*update mi_prt"),
         ("05", "no format version"),
         ("٥", "no format version"),
         ("-5", "no format version"),

@@ -7,6 +7,7 @@ from ..asset.provenance import open_scene_of
 from ..errors import LightError, SettingsError
 from ..lighting.environment import EnvironmentMap
 from ..lighting.map_file import ENDINGS
+from ..render.rendered import check_picture
 from .formats import format_of
 from .relight import relight_to_file
 
@@ -70,6 +71,7 @@ def relight_many(asset, pattern, maps=(), sensors=(0,), light=None, scene=None, 
     LightError, SceneError
     """
     is_picture = format_of(pattern).is_picture
+    check_picture(shown.get("size"), spp=shown.get("spp", 1))
     maps = map_files(maps) or [None]
     count = 1
     if is_picture:

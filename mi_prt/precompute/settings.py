@@ -97,7 +97,7 @@ OPTIONS = (
         "auto",
         "Coarse faces are tessellated down to this; auto: finely near objects, coarsely far from"
         " them; of shapes by name: 0.1,ground=5.",
-        "auto|METRES|NAME=METRES,…",
+        "auto|METRES|METRES,NAME=METRES",
         "vertices",
     ),
     Integer("count", 45_000, "Samples.", "N", "samples", least=1, most=MAX_POINTS),
