@@ -192,7 +192,8 @@ def precompute(
         " --component indirect\n\nmi-prt relight teapot.prt -o 'out/{map}_{sensor}.png' --envmap"
         " skies --sensor all\n\nmi-prt relight teapot.prt -o near.png --camera 0,2,6:0,0.5,0:45"
         "\n\nmi-prt relight room.prt -o walk.mp4 --light point:0,1.5,0:8,7,6"
-        " --light-path '-1,1.5,0 1,1.5,0 1,1.5,1' --renderer raster"
+        " --light-path '-1,1.5,0 1,1.5,0 1,1.5,1' --renderer raster\n\nmi-prt relight teapot.prt"
+        " -o day.mp4 --envmap sky.exr --turn y:360 --renderer raster"
     )
 )
 @flowing
@@ -229,6 +230,14 @@ def relight(
             help="Move the first --light along these places; OUT is a film.",
         ),
     ] = None,
+    turn: Annotated[
+        str | None,
+        typer.Option(
+            "--turn",
+            metavar="AXIS:DEGREES",
+            help="Turn distant light by so much, in equal steps; OUT is a film.",
+        ),
+    ] = None,
     frames: Frames = None,
     fps: FramesPerSecond = None,
     exposure: Exposure = "auto",
@@ -262,12 +271,12 @@ def relight(
         "exposure": exposure,
     }
     film = {k: v for k, v in (("frames", frames), ("fps", fps)) if v is not None}
-    if light_path is not None:
+    if light_path is not None or turn is not None:
         if len(maps) > 1 or sensors == ALL:
             raise SettingsError(
-                "--light-path makes one film: give one --envmap at most, and one --sensor"
+                "--light-path and --turn make one film: give one --envmap at most, and one --sensor"
             )
-        path = path_of(light_path)
+        path = None if light_path is None else path_of(light_path)
         chosen = take.light_of(maps[0] if maps else None, light)
         with progress_bar() as progress:
             result = animate(
@@ -276,12 +285,13 @@ def relight(
                 path,
                 light=chosen,
                 sensor=sensors[0],
+                turn=take.rotation_of(turn),
                 progress=progress,
                 **film,
                 **shown,
             )
     elif film:
-        raise SettingsError("--frames and --fps are of a film: give --light-path as well")
+        raise SettingsError("--frames and --fps are of a film: give --light-path or --turn as well")
     else:
         lights = take.light_of(None, light)
         files = relight_many(asset, output, maps, sensors, lights, nearest=nearest, **shown)

@@ -1,11 +1,11 @@
-"""Films of a light that moves through a scene."""
+"""Films of a light that moves through a scene, or of distant light that turns."""
 
 import time
 from dataclasses import dataclass, field
 from typing import Any
 
 from ..asset.provenance import open_scene_of
-from ..errors import LightError
+from ..errors import LightError, SettingsError
 from ..lighting.light import Light
 from ..render.display import display, exposure_report
 from ..render.integrator import check_direct
@@ -20,7 +20,7 @@ FRAME_SAMPLES = 1  # of a frame's pixel, along each side, of splats
 def animate(
     asset,
     output,
-    path,
+    path=None,
     frames=FRAMES,
     fps=FPS,
     light=None,
@@ -35,52 +35,63 @@ def animate(
     rotate=None,
     exposure="auto",
     force=False,
+    turn=None,
 ):
-    """Move the first local light along a path, and write a frame for each place of it.
+    """Move the first local light along a path, turn the distant light, or both, and write a film.
 
     Parameters
     ----------
     asset : Asset
     output : path
         .mp4 or .gif, or .png with the number of the frame in its name, such as frame-%03d.png.
-    path : LightPath, (k, 3), or text
+    path : LightPath, (k, 3), or text, optional
         Positions that the light goes through, such as '0,1,0 1,1,0 1,1,1'.
     frames, fps : int
     light : what `as_light` accepts, or a list of such
-        Whose first point, spot or area light moves; all else stays.
+        Whose first point, spot or area light moves along the path, and whose distant light turns;
+        all else stays.
     scene, sensor, size, renderer, spp, component, direct, rotate, exposure, force :
         As of `relight_to_file`.
     progress : callable(stage, done, total, detail)
+    turn : (axis, degrees), optional
+        By how much distant light turns in the whole film, in equal steps, so that a film of 360
+        degrees can be played in a loop.
 
     Returns
     -------
     dict
-        points, frames, seconds{relight, render} of all frames.
+        points, frames, exposure{ev, factor}, seconds{relight, render} of all frames.
+
+    Raises
+    ------
+    SettingsError, SceneError, LightError
+        Also if there is neither path nor turn, or no light that they move.
     """
+    if path is None and turn is None:
+        raise SettingsError("a film needs a light path (--light-path) or a turn (--turn y:360)")
     RENDERERS[renderer]
     check_picture(size, sensor, spp)
     check_direct(direct)
     Question(Light(()), component)  # which checks it
-    places = as_path(path).positions(frames)
+    places = None if path is None else as_path(path).positions(frames)
     check_frames_output(output, fps, frames, force)
     opened = open_scene_of(asset, scene)
-    moving = _Moving(asset.resolved(light, rotate, opened))
-    first = moving.at(places[0])
+    moving = _Moving(asset, asset.resolved(light, rotate, opened), places, turn, frames)
     film = _Film(
-        Picture(asset, opened, first, component, direct, exposure=exposure),
+        Picture(asset, opened, moving.at(0), component, direct, exposure=exposure),
         moving,
         progress,
         frames,
     )
-    # A light that is a shape is seen: what is drawn changes with its place.
-    runs = [[place] for place in places] if moving.part.is_shape else [places]
+    numbers = range(frames)
+    runs = [[number] for number in numbers] if moving.is_seen else [numbers]
 
     def pictures():
         for run in runs:
             film.picture.move(moving.at(run[0]))
             with film.picture.drawn(sensor, size, renderer, spp, FRAME_SAMPLES) as draw:
-                for place in run:
-                    yield film.frame(place, draw)
+                for number in run:
+                    yield film.frame(number, draw)
 
     write_frames(output, pictures(), fps)
     seconds = {name: round(value, 5) for name, value in film.seconds.items()}
@@ -93,23 +104,43 @@ def animate(
 
 
 class _Moving:
-    """Light whose first local part is taken from place to place."""
+    """Light in each frame: its first local part at a place of a path, its distant light turned."""
 
-    def __init__(self, light):
-        found = [i for i, part in enumerate(light.parts) if part.is_movable]
-        if not found:
+    def __init__(self, asset, light, places, turn, frames):
+        self._places, self._turn, self._frames = places, turn, frames
+        moved = [i for i, part in enumerate(light.parts) if part.is_movable]
+        if places is not None and not moved:
             raise LightError(
                 "a light path moves the first point, spot or area light that is given: pass one"
                 " (--light point:0,0,0:r,g,b)"
             )
-        self._parts, self._index = light.parts, found[0]
-        self.part = light.parts[found[0]]
+        if turn is not None and light.distant.is_empty:
+            raise LightError(
+                "a turn is of distant light, and there is none: pass one (--envmap sky.exr)"
+            )
+        self._parts = list(light.parts)
+        self._index = moved[0] if places is not None else None
+        # what turns is prepared for it once
+        self._distant = light.distant if turn is None else asset.prepare_light(light.distant)
 
-    def at(self, place):
-        """The Light with the part at a place (3,)."""
-        parts = list(self._parts)
-        parts[self._index] = self.part.moved(place)
-        return Light(tuple(parts))
+    @property
+    def is_seen(self):
+        """Whether what is drawn changes from frame to frame: a lamp that is a shape, a sky."""
+        moves = self._index is not None and self._parts[self._index].is_shape
+        return moves or self._turn is not None
+
+    def at(self, number):
+        """The Light of a frame."""
+        distant = self._distant
+        if self._turn is not None:
+            axis, degrees = self._turn
+            distant = distant.rotated(axis, degrees * number / self._frames)
+        local = [
+            part.moved(self._places[number]) if i == self._index else part
+            for i, part in enumerate(self._parts)
+            if not part.is_distant
+        ]
+        return Light((*distant.parts, *local))
 
 
 @dataclass(eq=False)
@@ -124,10 +155,10 @@ class _Film:
     factor: float | None = None
     seconds: dict = field(default_factory=lambda: {"relight": 0.0, "render": 0.0})
 
-    def frame(self, place, draw):
-        """The displayed image (h, w, 3) with the light at a place."""
+    def frame(self, number, draw):
+        """The displayed image (h, w, 3) of a frame."""
         started = time.perf_counter()
-        self.picture.move(self.moving.at(place))
+        self.picture.move(self.moving.at(number))
         irradiance = self.picture.irradiance()
         relit = time.perf_counter()
         image = draw(irradiance)
