@@ -2,6 +2,8 @@
 from its loaders, in Python and on the command line; and images of any number of samples.
 """
 
+import json
+
 import numpy as np
 import pytest
 from conftest import rectangle, relative_l2, scene, sphere
@@ -293,3 +295,15 @@ def test_the_command_line_refuses_numbers(path, tmp_path, capsys):
             main(["relight", str(path), *arguments[:-1], str(tmp_path / arguments[-1])])
         err = capsys.readouterr().err
         assert exit.value.code == 2 and said in err.splitlines()[-1], err
+
+
+def test_errors_are_json_where_results_would_be(tmp_path, capsys):
+    """One object on one line, with the type and the text of what is said without --json."""
+    missing = str(tmp_path / "a.prt")
+    for arguments in ([missing], [missing, "--json"]):
+        with pytest.raises(SystemExit) as exit:
+            main(["relight", *arguments, "-o", str(tmp_path / "a.png")])
+        assert exit.value.code == 2
+    plain, told = capsys.readouterr().err.splitlines()
+    told = json.loads(told)["error"]
+    assert told["type"] == "AssetError" and plain == f"mi-prt: {told['message']}"

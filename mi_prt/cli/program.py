@@ -1,5 +1,6 @@
 """The program around the commands: whatever happens in them ends in one line and an exit code."""
 
+import json
 import os
 import signal
 import sys
@@ -52,7 +53,7 @@ def _code_of(arguments):
             note("interrupted")
         return exit.code or 0
     except PrtError as error:
-        note(str(error))
+        _tell(error, "--json" in arguments)
         return error.exit_code
     except MemoryError:
         note("out of memory: use fewer --directions or a longer --edge-length, or set --max-memory")
@@ -61,6 +62,15 @@ def _code_of(arguments):
         note(f"{name}: {error.strerror or error}")
         return 2 if error.filename else 1
     return 1
+
+
+def _tell(error, as_json):
+    """A line on stderr: what went wrong, as JSON where results would be."""
+    if as_json:
+        told = {"error": {"type": type(error).__name__, "message": str(error)}}
+        print(json.dumps(told), file=sys.stderr)
+    else:
+        note(str(error))
 
 
 def _flushed(code):
