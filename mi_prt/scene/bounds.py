@@ -7,7 +7,6 @@ import numpy as np
 from ..errors import SceneError
 
 WIDE = 1 / 16  # of the scene's size, above which a shape may be a ground to all others
-LEAST = 1 / 64  # of the largest coordinates and sizes, that offsets are at least measured by
 FAR = 1000  # extents of a scene from the origin, from which on it is blurred
 
 
@@ -49,10 +48,12 @@ def box_of(shape):
 
 
 def scale_of(mi_scene):
-    """Length that offsets and tolerances are measured by: the diagonal of the box around a scene.
+    """Length that offsets and tolerances are measured by: diagonal of the box around a scene, or
+    its largest coordinate.
 
-    Where some shapes are far wider than all others together (a ground of kilometres under a house),
-    it is the diagonal around the others; but no less than float32 allows beside such coordinates.
+    Where some shapes are far wider than all others together (a ground of kilometres under a house)
+    it is a sixteenth of that, or the largest coordinate of the others: rays would start decimetres
+    off the surface otherwise.
 
     Raises
     ------
@@ -64,10 +65,10 @@ def scale_of(mi_scene):
     boxes = np.array([box_of(shape) for shape in mi_scene.shapes()]).reshape(-1, 2, 3)
     others = boxes[_diagonal(boxes) <= WIDE * whole]
     if len(others):
-        rest = _diagonal(np.stack([others[:, 0].min(axis=0), others[:, 1].max(axis=0)]))
-        if rest <= WIDE * whole:
-            whole = max(rest, LEAST * whole)
-    return float(max(whole, LEAST * np.abs(box).max()))
+        rest = np.stack([others[:, 0].min(axis=0), others[:, 1].max(axis=0)])
+        if _diagonal(rest) <= WIDE * whole:
+            return float(max(WIDE * whole, np.abs(rest).max()))
+    return float(max(whole, np.abs(box).max()))
 
 
 def _diagonal(boxes):
