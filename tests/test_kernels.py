@@ -2,6 +2,8 @@
 literals, each of which would be compiled anew (a second or more).
 """
 
+import gc
+
 import numpy as np
 import pytest
 from conftest import cube, open_scene, rectangle, sample_points, sampled, scene
@@ -25,11 +27,19 @@ def scenes():
 
 
 def compiled(run, values):
-    """Kernels that are compiled for values after the first."""
-    run(values[0])
-    with count_kernels() as kernels:
-        for value in values[1:]:
-            run(value)
+    """Kernels that are compiled for values after the first.
+
+    Shapes of scenes that are no longer used are in each kernel until they are collected.
+    """
+    gc.collect()
+    gc.disable()
+    try:
+        run(values[0])
+        with count_kernels() as kernels:
+            for value in values[1:]:
+                run(value)
+    finally:
+        gc.enable()
     assert kernels.launched >= len(values) - 1
     return kernels.compiled
 

@@ -6,6 +6,7 @@ import numpy as np
 
 from ..render.developed import developed
 from ..scene.bounds import scale_of
+from ..system.arrays import packets
 from ..system.runtime import mitsuba
 
 LANES = 1 << 21
@@ -264,8 +265,8 @@ def _interactions(mi_scene, points):
     # A rim may lie on another surface, where Mitsuba's own offset along the normal would leave rays
     # on either side of it.
     positions = points.positions + np.float32(RIM_INSET * scale_of(mi_scene)) * points.insets
-    positions, normals = mi.Float(positions.ravel()), mi.Float(points.normals.ravel())
-    geometric = mi.Float(points.geometric_normals.ravel())
+    positions, normals = packets(positions), packets(points.normals)
+    geometric = packets(points.geometric_normals)
 
     def interaction(index):
         si = dr.zeros(mi.SurfaceInteraction3f, dr.width(index))

@@ -5,6 +5,7 @@ import numpy as np
 from ..errors import SceneError
 from ..scene.mesh import mesh_arrays
 from ..scene.surface_table import SurfaceTable
+from ..system.arrays import indices, packets
 from ..system.runtime import mitsuba
 from .layout import Locator
 from .tessellate import TESSELLATED_SHAPES
@@ -39,15 +40,15 @@ class PatchLocator(Locator):
 
         mi = mitsuba()
         patches = points.layout
-        self._keep = mi.Float(np.where(points.buried, 0.0, 1.0).astype(np.float32))
-        self._positions = mi.Float(points.positions.ravel())
+        self._keep = packets(np.where(points.buried, 0.0, 1.0).astype(np.float32))
+        self._positions = packets(points.positions)
         self._behind = dr.opaque(mi.Float, _BEHIND * float(np.median(patches.spacing(points))))
         self._match(scene, points)
-        self._levels = mi.UInt32(patches.levels.ravel().astype(np.uint32))
-        self._offsets = mi.UInt32(patches.offsets.astype(np.uint32))
-        self._nodes = mi.UInt32(patches.nodes.astype(np.uint32))
-        self._back = mi.UInt32(patches.back.astype(np.uint32))
-        self._children = mi.UInt32(patches.children.astype(np.uint32))
+        self._levels = indices(patches.levels.ravel())
+        self._offsets = indices(patches.offsets)
+        self._nodes = indices(patches.nodes)
+        self._back = indices(patches.back)
+        self._children = indices(patches.children)
         self._is_cut = bool(patches.children.any())
 
     def interpolated(self, values, pi, si, ray, active):
@@ -107,7 +108,6 @@ class PatchLocator(Locator):
 
     def _match(self, scene, points):
         """Fill the tables that lead from (surface, primitive) to patches."""
-        mi = mitsuba()
         faces = _FaceIndex(points)
         analytic = {s["signature"]: s["first_patch"] for s in points.surfaces if s["patches"] > 0}
         tables, starts, total = [np.empty(0, np.int64)], [], 0
@@ -134,8 +134,8 @@ class PatchLocator(Locator):
             tables.append(patch)
             total += len(patch)
         self._surfaces = SurfaceTable(scene.surfaces)
-        self._starts = mi.UInt32(np.array(starts, np.uint32))
-        self._patch = mi.UInt32(np.concatenate(tables).astype(np.uint32))
+        self._starts = indices(np.array(starts, np.uint32))
+        self._patch = indices(np.concatenate(tables))
 
     def locate(self, pi, si, active):
         """The points around hits.

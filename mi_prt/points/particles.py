@@ -16,6 +16,7 @@ import numpy as np
 from ..errors import SceneError
 from ..scene.materials import facing, reflectance_at
 from ..scene.surface_table import SurfaceTable
+from ..system.arrays import packets
 from ..system.runtime import mitsuba
 from .thinning import thin
 
@@ -282,7 +283,7 @@ def _source_rays(scene, count, seed):
         np.concatenate([_rows(getattr(ray, name), n) for ray, n in rays]) for name in ("o", "d")
     )
     # `take` of rows that lie together is several times as fast as an index
-    return [mi.Float(np.ascontiguousarray(v).take(random, axis=0).ravel()) for v in vectors]
+    return [packets(np.ascontiguousarray(v).take(random, axis=0)) for v in vectors]
 
 
 def _sends_rays(source):

@@ -121,7 +121,8 @@ def _lanes(vectors):
     """
     import drjit as dr
 
+    from ..system.arrays import packets
     from ..system.runtime import mitsuba
 
     mi = mitsuba()
-    return dr.gather(mi.Vector3f, mi.Float(vectors.ravel()), dr.arange(mi.UInt32, len(vectors)))
+    return dr.gather(mi.Vector3f, packets(vectors), dr.arange(mi.UInt32, len(vectors)))

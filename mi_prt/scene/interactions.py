@@ -11,6 +11,7 @@ meshes are one gather, and those of spheres, cylinders and disks a closed form e
 
 import numpy as np
 
+from ..system.arrays import indices, packets
 from ..system.runtime import mitsuba
 from .mesh import mesh_arrays
 from .surface_table import SurfaceTable
@@ -52,9 +53,9 @@ class _Table:
         self._kinds = sorted({_KINDS[s.kind] for s in surfaces})
         meshes = _Meshes()
         numbers = [(_KINDS[s.kind], *meshes.place(s)) for s in surfaces]
-        self._numbers = mi.UInt32(np.array(numbers, np.uint32).ravel())
-        self._floats = mi.Float(np.array([_placed(s) for s in surfaces], np.float32).ravel())
-        self._faces = mi.UInt32(_joined(meshes.faces, np.uint32))
+        self._numbers = indices(np.array(numbers, np.uint32))
+        self._floats = packets(np.array([_placed(s) for s in surfaces], np.float32))
+        self._faces = indices(_joined(meshes.faces, np.uint32))
         self._positions, self._normals, self._uv = (
             mi.Float(_joined(x, np.float32)) for x in (meshes.positions, meshes.normals, meshes.uv)
         )

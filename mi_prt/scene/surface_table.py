@@ -6,6 +6,7 @@
 
 import numpy as np
 
+from ..system.arrays import indices
 from ..system.runtime import mitsuba
 
 NO_SURFACE = 0xFFFFFFFF
@@ -43,8 +44,8 @@ class SurfaceTable:
                 table[group[instance], shape] = index - int(first[instance])
         self._first, self._group = mi.UInt32(first), mi.UInt32(group)
         self._columns = dr.opaque(mi.UInt32, columns)
-        self._table = mi.UInt32(table.ravel())
-        self._shapes = mi.UInt32(np.array([shape for _, shape in places], np.uint32))
+        self._table = indices(table)
+        self._shapes = indices(np.array([shape for _, shape in places], np.uint32))
 
     def index(self, hit, active=True):
         """Index (mi.UInt32) of the surface of each mi.SurfaceInteraction3f; NO_SURFACE where there

@@ -193,11 +193,12 @@ def _all_inside(scene, points, vectors):
     lane = dr.arange(mi.UInt32, len(toward))  # gathered: arrays read lane by lane compile anew
     point = lane // dr.opaque(mi.UInt32, count)
     ray = mi.Ray3f(
-        dr.gather(mi.Point3f, mi.Float(origins.ravel()), point),
-        dr.gather(mi.Vector3f, mi.Float(toward.ravel()), lane),
+        dr.gather(mi.Point3f, packets(origins), point),
+        dr.gather(mi.Vector3f, packets(toward), lane),
     )
     hit = scene.intersect(ray)
     near = np.minimum(1e-3 * scene.scale, 0.1 * np.sqrt(points.areas)).astype(np.float32)
-    near = dr.gather(mi.Float, mi.Float(near), point)
+    # one more: what has a single entry is not gathered but compiled in another way
+    near = dr.gather(mi.Float, packets(np.append(near, 0)), point)
     inside = hit.is_valid() & ((dr.dot(hit.n, ray.d) > 0) | (hit.t < near))
     return np.array(inside).reshape(-1, count).all(axis=1)

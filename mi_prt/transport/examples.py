@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from ..system.arrays import packets
 from ..system.runtime import mitsuba
 from .bits import LANES, RAY_OFFSET
 
@@ -36,10 +37,10 @@ def trace_examples(scene, points, places, lanes=LANES):
     count = len(places)
     offset = RAY_OFFSET * scene.scale
     origins, normals = (
-        mi.Float(points.ray_origins(offset).ravel()),
-        mi.Float(points.normals.ravel()),
+        packets(points.ray_origins(offset)),
+        packets(points.normals),
     )
-    areas, lights = mi.Float(points.areas), mi.Float(places.ravel())
+    areas, lights = packets(points.areas), packets(places)
     step = max(1, lanes // count)
     for first in range(0, len(points), step):
         size = min(step, len(points) - first)

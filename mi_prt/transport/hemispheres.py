@@ -13,7 +13,7 @@ import scipy.sparse
 
 from ..directions.hemisphere import frame_of, frames
 from ..scene.materials import facing, reflectance_at
-from ..system.arrays import packets
+from ..system.arrays import indices, packets
 from ..system.parallel import map_chunks
 from ..system.runtime import mitsuba
 from .bits import LANES, RAY_OFFSET
@@ -64,7 +64,7 @@ class HemisphereTracer:
         self._scene, self._hemisphere = scene, hemisphere
         self._channels = channels
         self._locator = points.locator(scene)
-        self._rank = mi.UInt32(clusters.rank.astype(np.uint32))
+        self._rank = indices(clusters.rank)
         self._vectors = packets(np.pad(hemisphere.vectors, ((0, 0), (0, 1))))
         self._origins = mi.Float(
             points.at(clusters.order).ray_origins(RAY_OFFSET * scene.scale).ravel()
@@ -98,7 +98,7 @@ class HemisphereTracer:
         per_point = dr.opaque(mi.UInt32, count)
         local = lane // per_point
         v = dr.gather(mi.Vector4f, self._vectors, lane - local * per_point)
-        rows = mi.Float(np.ascontiguousarray(rotations, np.float32).ravel())
+        rows = packets(np.ascontiguousarray(rotations, np.float32))
         x, y, z = (dr.gather(mi.Vector3f, rows, 3 * local + i) for i in range(3))
         direction = mi.Vector3f(*(a.x * v.x + a.y * v.y + a.z * v.z for a in (x, y, z)))
         origin = dr.gather(mi.Point3f, self._origins, local + dr.opaque(mi.UInt32, first))

@@ -15,6 +15,7 @@ import numpy as np
 import scipy.sparse
 
 from ..scene.materials import facing, reflectance_at
+from ..system.arrays import indices, packets
 from ..system.parallel import BLOCK_ROWS, map_chunks
 from ..system.runtime import mitsuba
 from .bits import LANES, RAY_OFFSET
@@ -139,10 +140,9 @@ class HopSampler:
     """
 
     def __init__(self, scene, points, transport, directions, rays, seed=0, lanes=LANES):
-        mi = mitsuba()
         self._scene, self._points, self._transport, self._seed = scene, points, transport, seed
         self._locator = points.locator(scene)
-        self._origins = mi.Float(points.ray_origins(RAY_OFFSET * scene.scale).ravel())
+        self._origins = packets(points.ray_origins(RAY_OFFSET * scene.scale))
         # Cell by cell: a sweep over all directions for each of a cell's rays would meet the strata
         # in the same places again and again.
         vectors = transport.vectors.swapaxes(0, 1).reshape(-1, 3)
@@ -219,9 +219,9 @@ class HopSampler:
         lane = dr.arange(mi.UInt32, lanes)
         rays = dr.opaque(mi.UInt32, self._rays)
         local = lane // rays
-        owner = dr.gather(mi.UInt32, mi.UInt32(index.astype(np.uint32)), local)
+        owner = dr.gather(mi.UInt32, indices(index), local)
         origin = dr.gather(mi.Point3f, self._origins, owner)
-        ray = mi.Ray3f(origin, dr.gather(mi.Vector3f, mi.Float(directions.ravel()), lane))
+        ray = mi.Ray3f(origin, dr.gather(mi.Vector3f, packets(directions), lane))
         active = dr.gather(mi.Bool, mi.Bool(active), local)
         pi = self._scene.occluders.ray_intersect_preliminary(ray, active=active)
         si = self._scene.interaction(pi, ray, active)

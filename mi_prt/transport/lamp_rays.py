@@ -3,6 +3,7 @@
 import numpy as np
 
 from ..scene.materials import facing, reflectance_at
+from ..system.arrays import packets
 from ..system.runtime import mitsuba
 from .bits import LANES, RAY_OFFSET
 from .hops import HOP, NOTHING
@@ -49,15 +50,15 @@ class LampRays:
         self._scene, self._lamps, self._locator = scene, lamps, locator
         self._count, self._k, self._rays = len(points), len(lamps), rays
         inset = np.float32(RAY_OFFSET * scene.scale) * points.insets
-        self._positions = mi.Float((points.positions + inset).ravel())
-        self._geometric = mi.Float(points.geometric_normals.ravel())
-        self._normals = mi.Float(points.normals.ravel())
-        self._direct = mi.Float(np.ascontiguousarray(direct, np.float32).ravel())
+        self._positions = packets(points.positions + inset)
+        self._geometric = packets(points.geometric_normals)
+        self._normals = packets(points.normals)
+        self._direct = packets(np.ascontiguousarray(direct, np.float32))
         self._offset = dr.opaque(mi.Float, RAY_OFFSET * scene.scale)
         self._seed = dr.opaque(mi.UInt32, seed % (1 << 32))
         self._aimed = aimed if self._k > aimed else 0  # 0: all of them
         if self._aimed:
-            self._chances = mi.Float(_chances(direct).ravel())
+            self._chances = packets(_chances(direct))
         # of one wavefront each: rays, and the sums of lamps
         widest = max(rays, 6 * self._k * aimed if self._aimed else 2 * self._k)
         self._step = max(1, lanes // widest)

@@ -7,6 +7,7 @@ import numpy as np
 
 from ..errors import LightError
 from ..scene.bounds import box_of
+from ..system.arrays import indices, packets
 from ..system.runtime import mitsuba
 from .bits import RAY_OFFSET
 
@@ -38,7 +39,7 @@ class Lamps:
         for emitter in emitters:
             _check(emitter)
         ids = [dr.reinterpret_array(mi.UInt32, mi.EmitterPtr(e))[0] for e in emitters]
-        self._ids = mi.UInt32(np.array(ids, np.uint32))
+        self._ids = indices(np.array(ids, np.uint32))
         self._scene, self._occluders = scene, scene.occluders
         self._offset = dr.opaque(mi.Float, RAY_OFFSET * scene.scale)
         # whether a lamp is a place without extent, to which one ray is exact
@@ -46,7 +47,7 @@ class Lamps:
 
         self._boxes = np.array([_box(e) for e in emitters], np.float32).reshape(-1, 2, 3)
         self._areas = np.array([_area(e) for e in emitters], np.float32)
-        self._box_of = mi.Float(self._boxes.ravel())
+        self._box_of = packets(self._boxes)
         self._area_of = mi.Float(self._areas)
 
     def __len__(self):

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..system.arrays import indices, packets
 from ..system.runtime import mitsuba
 from .bits import LANES, RAY_OFFSET
 from .lamp_table import Lamps
@@ -128,8 +129,8 @@ class _DirectSampler:
 
         mi = mitsuba()
         self._lamps, self._count, self._lanes = lamps, len(points), lanes
-        self._origins = mi.Float(points.ray_origins(RAY_OFFSET * scene.scale).ravel())
-        self._normals = mi.Float(points.normals.ravel())
+        self._origins = packets(points.ray_origins(RAY_OFFSET * scene.scale))
+        self._normals = packets(points.normals)
         self._positions = points.positions
         self._seed = dr.opaque(mi.UInt32, seed % (1 << 32))
         self.rays = 0
@@ -178,7 +179,7 @@ class _DirectSampler:
         if not len(point):
             return np.zeros((0, groups, 3), np.float32)
         self.rays += len(point) * groups * count * (2 if combined else 1)
-        points, lamps = (mi.UInt32(x.astype(np.uint32)) for x in (point, lamp))
+        points, lamps = (indices(x) for x in (point, lamp))
         of_each = dr.opaque(mi.UInt32, groups)
         lane = dr.arange(mi.UInt32, len(point) * groups)
         pair = lane // of_each

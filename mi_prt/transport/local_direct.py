@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ..lighting.places import Places
-from ..system.arrays import packets
+from ..system.arrays import indices, packets
 from ..system.runtime import mitsuba
 from .examples import raised_height
 from .hemispheres import cluster_frames
@@ -61,10 +61,10 @@ class LocalDirect:
         # of four components: gathered in one load
         self._groups = -(-depth.coefficients.shape[1] // 4)
         extra = 4 * self._groups - depth.coefficients.shape[1]
-        self._means = mi.Float(depth.means.ravel())
+        self._means = packets(depth.means)
         self._vectors = packets(np.pad(depth.vectors, ((0, 0), (0, 0), (0, extra))))
         self._coefficients = packets(np.pad(depth.coefficients, ((0, 0), (0, extra))))
-        self._labels = mi.UInt32(clusters.labels.astype(np.uint32))
+        self._labels = indices(clusters.labels)
         rotations = np.concatenate(
             [cluster_frames(points.normals[cluster]) for cluster in clusters.slices]
         )

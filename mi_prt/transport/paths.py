@@ -11,6 +11,7 @@ import numpy as np
 import scipy.sparse
 
 from ..scene.materials import facing, reflectance_at
+from ..system.arrays import indices, packets
 from ..system.parallel import BLOCK_ROWS, map_chunks
 from ..system.runtime import mitsuba
 from .bits import LANES, RAY_OFFSET
@@ -54,8 +55,8 @@ class PathSampler:
         self._paths, self._channels, self._encode = paths, channels, encode
         self._bounces = dr.opaque(mi.UInt32, NOTHING if bounces is None else bounces)
         self._offset = dr.opaque(mi.Float, RAY_OFFSET * scene.scale)
-        self._origins = mi.Float(points.ray_origins(RAY_OFFSET * scene.scale).ravel())
-        self._normals = mi.Float(points.normals.ravel())
+        self._origins = packets(points.ray_origins(RAY_OFFSET * scene.scale))
+        self._normals = packets(points.normals)
         self._seed = dr.opaque(mi.UInt32, seed % (1 << 32))
         self._step = max(1, lanes // paths)
         self.rays_per_point = paths
@@ -140,7 +141,7 @@ class PathSampler:
         lane = dr.arange(mi.UInt32, width)
         paths = dr.opaque(mi.UInt32, self._paths)
         local = lane // paths
-        owner = dr.gather(mi.UInt32, mi.UInt32(index.astype(np.uint32)), local)
+        owner = dr.gather(mi.UInt32, indices(index), local)
         number = lane - local * paths
         state = mi.sample_tea_32(owner, number + self._seed * 0x9E3779B9)
         random = mi.PCG32(initstate=mi.UInt64(state[0]), initseq=mi.UInt64(state[1]))
