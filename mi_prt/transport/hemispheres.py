@@ -60,15 +60,12 @@ class HemisphereTracer:
     """
 
     def __init__(self, scene, points, clusters, hemisphere, channels, lanes=LANES):
-        mi = mitsuba()
         self._scene, self._hemisphere = scene, hemisphere
         self._channels = channels
         self._locator = points.locator(scene)
         self._rank = indices(clusters.rank)
         self._vectors = packets(np.pad(hemisphere.vectors, ((0, 0), (0, 1))))
-        self._origins = mi.Float(
-            points.at(clusters.order).ray_origins(RAY_OFFSET * scene.scale).ravel()
-        )
+        self._origins = packets(points.at(clusters.order).ray_origins(RAY_OFFSET * scene.scale))
         self._step = max(1, lanes // len(hemisphere))
 
     def trace(self, cluster, rotations):

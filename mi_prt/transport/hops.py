@@ -222,7 +222,7 @@ class HopSampler:
         owner = dr.gather(mi.UInt32, indices(index), local)
         origin = dr.gather(mi.Point3f, self._origins, owner)
         ray = mi.Ray3f(origin, dr.gather(mi.Vector3f, packets(directions), lane))
-        active = dr.gather(mi.Bool, mi.Bool(active), local)
+        active = dr.gather(mi.UInt32, indices(active), local) > 0
         pi = self._scene.occluders.ray_intersect_preliminary(ray, active=active)
         si = self._scene.interaction(pi, ray, active)
         _, si.wi, reflects = facing(si, ray, self._scene.surfaces)
