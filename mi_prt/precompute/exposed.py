@@ -12,6 +12,7 @@ from ..transport.bits import find_buried
 
 ROUNDS = 5  # each halves the distance between points where it is called for
 PLACES = 16  # of each small triangle of buried points, at which it may be seen
+LANES = 1 << 18  # rays of a wavefront, some 30 MB: this runs before memory is shared out
 LEAST_SEEN = 0.1  # of the edge length's square, or of a smaller face: less is a sliver, and left
 
 
@@ -61,7 +62,7 @@ def exposed_points(scene, edge_length="auto"):
 
 def _cuts(scene, points, found, length):
     """Patches to cut, by number of surface: those with triangles of buried points that are seen."""
-    buried = find_buried(scene, points)
+    buried = find_buried(scene, points, lanes=LANES)
     layout = points.layout
     leaves = np.flatnonzero(layout.children == 0)
     triangles, leaf = leaf_triangles(layout.levels[leaves], layout.nodes)
@@ -99,7 +100,7 @@ def _share_seen(scene, points, triangles):
     corner = np.repeat(triangles[:, 0], PLACES)
     positions = np.einsum("kc,mcx->mkx", weights, points.positions[triangles]).reshape(-1, 3)
     places = replace(points.at(corner), positions=positions, insets=np.zeros_like(positions))
-    return 1 - find_buried(scene, places).reshape(-1, PLACES).mean(axis=1)
+    return 1 - find_buried(scene, places, lanes=LANES).reshape(-1, PLACES).mean(axis=1)
 
 
 def _by_surface(patches, points, found):

@@ -42,7 +42,7 @@ class SurfaceTable:
         for instance, found in members.items():
             for index, shape in found:
                 table[group[instance], shape] = index - int(first[instance])
-        self._first, self._group = mi.UInt32(first), mi.UInt32(group)
+        self._first, self._group = indices(first), indices(group)
         self._columns = dr.opaque(mi.UInt32, columns)
         self._table = indices(table)
         self._shapes = indices(np.array([shape for _, shape in places], np.uint32))

@@ -48,7 +48,7 @@ class Lamps:
         self._boxes = np.array([_box(e) for e in emitters], np.float32).reshape(-1, 2, 3)
         self._areas = np.array([_area(e) for e in emitters], np.float32)
         self._box_of = packets(self._boxes)
-        self._area_of = mi.Float(self._areas)
+        self._area_of = packets(self._areas)
 
     def __len__(self):
         return len(self.are_places)
