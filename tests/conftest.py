@@ -4,12 +4,10 @@ Scenes are y-up, lengths in metres.
 """
 
 import gc
-import importlib
 import os
 from dataclasses import dataclass, replace
 
 import numpy as np
-import pytest
 import scipy.stats
 from mutants import Parts
 from threadpoolctl import threadpool_limits
@@ -305,14 +303,6 @@ def sampled(parts, edge_length, directions="cubemap:16", rays_per_direction=1):
     return SampledScene(
         opened, points, lattice, transport, blocked_share(transport, lattice.solid_angles)
     )
-
-
-@pytest.fixture
-def few_compared_points(monkeypatch):
-    """`compare` takes the truth at 512 points: with as many paths at each its bias and error are
-    told as well, where a test does not depend on their number.
-    """
-    monkeypatch.setattr(importlib.import_module("mi_prt.evaluate.compare"), "COMPARED_POINTS", 512)
 
 
 def distant(asset):

@@ -136,7 +136,7 @@ def made(request):
 def truths(made):
     """Some points, and Mitsuba's direct and indirect irradiance there, by the light's name."""
     shown = np.flatnonzero(~made.asset.buried)
-    chosen = np.sort(np.random.default_rng(1).permutation(shown)[:100])
+    chosen = np.sort(np.random.default_rng(1).permutation(shown)[:200])
     points, found = made.asset.points.at(chosen), {}
     for name, light in LIGHTS.items():
         lit = lit_scene(made.scene, made.asset.resolved(light, scene=made.scene), modelled=True)

@@ -103,7 +103,7 @@ def test_precompute_prints_the_promised_keys_and_nothing_else_on_stdout(
 
 
 @pytest.mark.parametrize("bounces", ["1", "3", "auto"])
-def test_json_is_strict(few_compared_points, tmp_path, capsys, bounces):
+def test_json_is_strict(tmp_path, capsys, bounces):
     """Between white walls there is no bound of what a few reflections leave out; and infinity is no
     JSON.
     """
@@ -183,9 +183,7 @@ def test_turning_the_light_once_round_changes_nothing_and_half_way_does(asset, t
     assert np.linalg.norm(radiance[180] - radiance[0]) > 0.1 * np.linalg.norm(radiance[0])
 
 
-def test_compare_prints_the_promised_keys_and_leaves_a_report(
-    asset, few_compared_points, tmp_path, capsys
-):
+def test_compare_prints_the_promised_keys_and_leaves_a_report(asset, tmp_path, capsys):
     code, out, _ = run(
         capsys, "compare", asset, "-o", tmp_path / "r", "--size", "64x48", "--spp", "32", "--json"
     )

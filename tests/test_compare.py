@@ -53,9 +53,7 @@ def whole(room, tmp_path_factory):
     return mi_prt.compare(room, folder, scene=lit_room(), spp=64), folder
 
 
-def test_the_reference_is_the_scene_as_modelled_or_as_written(
-    room, whole, few_compared_points, tmp_path
-):
+def test_the_reference_is_the_scene_as_modelled_or_as_written(room, whole, tmp_path):
     """As modelled the bulb is dark and the plastic diffuse, so the result is right; as written it
     lacks their light.
 
@@ -79,9 +77,7 @@ def test_the_reference_is_the_scene_as_modelled_or_as_written(
 
 
 @pytest.mark.parametrize(("bounces", "indirect"), [(0, "solve"), (1, "solve"), (1, "paths")])
-def test_the_reference_has_the_reflections_that_were_asked_for(
-    whole, few_compared_points, tmp_path, bounces, indirect
-):
+def test_the_reference_has_the_reflections_that_were_asked_for(whole, tmp_path, bounces, indirect):
     """Then the result is right, by the tolerances of above, and the report says what both sides
     have. Of the picture's light the reflections are 3.6 %, and those after the first 0.5 %; five
     renders with other seeds differ by 0.06 %.
@@ -142,7 +138,7 @@ def test_reported_errors_are_those_of_the_pictures(whole):
     )
 
 
-def test_another_light_and_its_rotation_reach_both_sides(room, few_compared_points, tmp_path):
+def test_another_light_and_its_rotation_reach_both_sides(room, tmp_path):
     """Result and reference are lit by the same turned map: unbiased, and not what the map gives
     unturned.
     """

@@ -71,7 +71,7 @@ def floor_irradiance(light):
 
 def truth_on_floor(mi_scene, spp=1 << 15):
     """144 points on the floor y = 0, and Mitsuba's irradiance (Reference) there in a scene."""
-    points = sample_points(open_scene(scene(floor=rectangle(size=2))), 0.5)
+    points = sample_points(open_scene(scene(floor=rectangle(size=2))), 0.25)
     return points, point_irradiance(mi_scene, points, spp)
 
 

@@ -75,7 +75,7 @@ def test_lights_shine_under_every_map(folder, capsys):
     np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-3)
 
 
-def test_a_camera_on_the_command_line(folder, capsys, few_compared_points):
+def test_a_camera_on_the_command_line(folder, capsys):
     shown = ["--camera", CAMERA, "--size", "8x6", "--envmap", folder / "skies" / "white.exr"]
     picture = folder / "by_camera.exr"
     code, _, err = run(capsys, "relight", folder / "a.prt", "-o", picture, *shown, "--spp", "16")

@@ -115,7 +115,7 @@ def test_objects_of_trimesh_are_passed_again():
     assert asset.render(WHITE, scene=scene, size=(8, 6), spp=1).shape == (6, 8, 3)
 
 
-def test_a_mesh_is_compared_with_the_truth(tmp_path, few_compared_points):
+def test_a_mesh_is_compared_with_the_truth(tmp_path):
     trimesh.creation.icosphere(2).export(tmp_path / "ball.ply")
     asset = mi_prt.precompute(tmp_path / "ball.ply", **(FAST | {"directions": "cubemap:16"}))
     report = mi_prt.compare(asset, tmp_path / "report", WHITE, size=(16, 12), spp=16)

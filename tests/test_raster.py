@@ -114,7 +114,7 @@ def test_agrees_with_the_integrator(name, mean, high):
     """
     opened = open_scene(SCENES / f"{name}.xml")
     asset = mi_prt.precompute(
-        opened, directions="cubemap:8", coefficients=16, bounces=0
+        opened, directions="cubemap:16", coefficients=32, bounces=0
     )  # any irradiance will do
     irradiance = asset.irradiance(scene_light(opened))
     factor = exposure(asset.outgoing_radiance(irradiance))

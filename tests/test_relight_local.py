@@ -215,7 +215,7 @@ def test_plugin_follows_the_scenes_own_lamps(asset):
         parameters.update()
 
 
-def test_comparison_tells_components(asset, few_compared_points, tmp_path):
+def test_comparison_tells_components(asset, tmp_path):
     report = mi_prt.compare(asset, tmp_path / "r", LIGHT, scene=room(), spp=64)
     assert set(report["components"]) == {"direct", "indirect"}
     assert report["points"]["relative_rmse_beyond_noise"] < 0.12
@@ -362,7 +362,7 @@ def run(capsys, *arguments):
     return end.value.code, out.out, out.err
 
 
-def test_command_line(from_file, few_compared_points, tmp_path, capsys):
+def test_command_line(from_file, tmp_path, capsys):
     code, out, _ = run(
         capsys,
         "relight",

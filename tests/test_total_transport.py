@@ -369,7 +369,7 @@ def pictured(request):
     )
 
 
-def test_compare_takes_a_reference_of_as_many_reflections(pictured, few_compared_points, tmp_path):
+def test_compare_takes_a_reference_of_as_many_reflections(pictured, tmp_path):
     """`compare` against Mitsuba's path tracer at the matching depth: bias below 1 % at points and
     in the picture.
 
